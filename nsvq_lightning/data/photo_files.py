@@ -132,7 +132,9 @@ def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]
     return found[0], factor or 1
 
 
-def find_masks(images: Sequence[ColmapImage], root: Path, folders: Sequence[str], photos: Path) -> list[Path | None]:
+def find_masks(
+    images: Sequence[ColmapImage], files: Sequence[Path], photos: Path, root: Path, folders: Sequence[str]
+) -> list[Path | None]:
     """The mask of each photo: the one that its model names, or the one of its name in a folder.
 
     Of ``cam/1.jpg`` that is ``cam/1.jpg.png`` (as COLMAP has it), ``cam/1.png`` (as nerfstudio has it) or
@@ -141,52 +143,60 @@ def find_masks(images: Sequence[ColmapImage], root: Path, folders: Sequence[str]
 
     Args:
         images: The photos.
+        files: Their files.
+        photos: Folder that these are in.
         root: Scene folder.
         folders: Names of folders of masks in it; the first one that exists counts.
-        photos: Folder of the photos.
 
     Raises:
         SceneError: A mask that the model names does not exist, or two files fit a photo.
     """
-    given = [image.mask for image in images if image.mask is not None]
-    lost = [path for path in given if not path.is_file()]
+    given = [image.mask for image in images]
+    lost = [path for path in given if path is not None and not path.is_file()]
     if lost:
         raise SceneError(f"{len(lost)} masks do not exist, first {lost[0]}: copy them, or remove mask_path")
-    places = [root / name for name in folders if (root / name).is_dir()][:1]
-    expected = bool(places)
-    if not places and not given and folders[-1] == "masks":
-        places = [*sorted(path for path in root.glob("*") if path.is_dir() and "mask" in path.name.lower()), photos]
-    found = {place: masks for place in places if (masks := _masks_in(place, images, beside=place == photos))}
-    if expected and not found and not given:
-        name = Path(images[0].name)
-        usual = name.with_suffix(".png")
-        log.warning("%s has no mask of any photo: that of %s would be %s.png or %s", places[0], name, name, usual)
-    elif not places and not given:
+    relative = [str(path.relative_to(photos)) if path.is_relative_to(photos) else path.name for path in files]
+    named = [(image.name, name) for image, name in zip(images, relative, strict=True)]
+    usual = [root / name for name in folders if (root / name).is_dir()][:1]
+    places = usual
+    if not usual and not any(given) and folders[-1] == "masks":
+        places = [path for path in sorted(root.glob("*")) if path.is_dir() and "mask" in path.name.lower()]
+        places.append(photos)
+    found = {place: masks for place in places if any(masks := _masks_in(place, named, beside=place == photos))}
+    shown = " and ".join(map(str, found or usual))
+    if len(found) == 1:
+        if not usual:
+            log.info("masks are read from %s", shown)
+        (masks,) = found.values()
+        return [own or other for own, other in zip(given, masks, strict=True)]
+    if found:
+        log.warning("masks in %s are not used: choose a folder (--data.masks)", shown)
+    elif usual and not any(given):
+        name = Path(relative[0])
+        png = name.with_suffix(".png")
+        log.warning("%s has no mask of any photo: that of %s would be %s.png or %s", shown, name, name, png)
+    elif not places and not any(given):
         log.warning("there is no folder %s: no photo has a mask", root / folders[-1])
-    elif len(found) > 1:
-        log.warning("masks in %s are not used: choose a folder (--data.masks)", " and in ".join(map(str, found)))
-        found = {}
-    elif found and not expected:
-        log.info("masks are read from %s", *found)
     elif any(path.name.startswith("dynamic_mask_") for path in photos.glob("*")):
         log.warning("dynamic_mask_* in %s are not used: white leaves out in them; put inverted ones in masks/", photos)
-    chosen = next(iter(found.values()), {})
-    return [image.mask or chosen.get(image.name) for image in images]
+    return given
 
 
-def _masks_in(folder: Path, images: Sequence[ColmapImage], beside: bool = False) -> dict[str, Path]:
-    """The masks in a folder by the name of their photo; ``beside`` the photos, none has the name of its photo."""
+# What masks are called beside the stem of their photo.
+_MASK_NAMES = ("{}_mask", "{}.mask", "mask_{}")
+
+
+def _masks_in(folder: Path, named: Sequence[tuple[str, str]], beside: bool) -> list[Path | None]:
+    """The masks in a folder of photos by either name; ``beside`` the photos, none has the name of its photo."""
     files = _Files(folder, _photos_in(folder))
-    found = {}
-    for image in images:
-        stem = _stem(image.name)
-        last = stem.replace("\\", "/").rpartition("/")[2]
-        names = [f"{image.name}.png", f"{stem}_mask", f"{stem}.mask", f"{stem.removesuffix(last)}mask_{last}"]
-        if not beside:
-            names.insert(1, stem)
-        fitting = next(filter(None, map(files.nearest, names)), [])
+    found: list[Path | None] = []
+    for names in named:
+        wanted = [f"{name}.png" for name in names]
+        stems = [PurePosixPath(_stem(_key(name))) for name in names]
+        wanted += [] if beside else map(str, stems)
+        wanted += [str(stem.with_name(form.format(stem.name))) for stem in stems for form in _MASK_NAMES]
+        fitting = next(filter(None, map(files.nearest, wanted)), [])
         if len(fitting) > 1:
-            raise SceneError(f"{fitting[0]} and {fitting[1]} are masks of {image.name}: remove one of them")
-        if fitting:
-            found[image.name] = fitting[0]
+            raise SceneError(f"{fitting[0]} and {fitting[1]} are masks of {names[0]}: remove one of them")
+        found += fitting or [None]
     return found

@@ -11,11 +11,8 @@ from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.ply import PlyHeader, read_ply_columns, read_ply_header
 from nsvq_lightning.splats.conventions import SH_C0
 
-Points = tuple[NDArray[np.float64], NDArray[np.uint8]]
-NO_POINTS: Points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 
-
-def read_points(path: Path) -> Points:
+def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Positions ``[P, 3]`` and RGB colours ``[P, 3]`` of a ``.ply`` point cloud; points without a colour are grey.
 
     Raises:

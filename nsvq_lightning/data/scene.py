@@ -187,7 +187,8 @@ def load_scene(
         )
     mask_files: list[Path | None] = [None] * len(views)
     if masks is not None:
-        mask_files = find_masks(poses.images, root, [f"{masks}_{factor}", masks] if factor else [masks], folder)
+        mask_folders = [f"{masks}_{factor}", masks] if factor else [masks]
+        mask_files = find_masks(poses.images, files, folder, root, mask_folders)
     sources = _image_sources(poses, files, mask_files, divisor, max_width if factor is None else None)
     cameras = tuple(_camera(image, source) for image, source in zip(poses.images, sources, strict=True))
     if not len(poses.points):

@@ -19,7 +19,7 @@ from nsvq_lightning.data import PANORAMA, colmap
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, check_name
 from nsvq_lightning.data.images import image_head
 from nsvq_lightning.data.photo_files import locate
-from nsvq_lightning.data.points import NO_POINTS, cloud_in, read_points
+from nsvq_lightning.data.points import cloud_in, read_points
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.poses import looked_at, poses
@@ -181,7 +181,7 @@ class _Frame:
             matrix = np.zeros(0)
         if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) <= colmap.LARGEST).all():
             raise self.error("has no transform_matrix of 4 by 4 finite numbers")
-        if not np.array_equal(matrix[3:], np.eye(4)[3:][: len(matrix) - 3]):
+        if not np.allclose(matrix[3:], (0, 0, 0, 1), atol=1e-6):
             raise self.error("has a transform_matrix whose last row is not 0 0 0 1; is it transposed?")
         # Blender's cameras may be scaled.
         axes = matrix[:3, :3] / np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-30)
@@ -293,12 +293,12 @@ def _points(
     name = head.get("ply_file_path")
     if isinstance(name, str):
         check_name(_plain(name), f"ply_file_path in {root}", allow_outside)
-        path, (points, colors) = root / _plain(name), read_points(root / _plain(name))
-    elif (cloud := cloud_in([root])) is not None:
-        path, (points, colors) = cloud, read_points(cloud)
+        path: Path | None = root / _plain(name)
+    elif (path := cloud_in([root])) is not None:
         log.info("%s names no points: those of %s are used", root, path)
-    else:
-        return NO_POINTS
+    if path is None:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    points, colors = read_points(path)
     try:
         applied = np.array(head.get("applied_transform"), np.float64)[:3]
     except (ValueError, TypeError, IndexError):

@@ -21,7 +21,7 @@ import nsvq_lightning
 from nsvq_lightning.callbacks import STANDARD
 from nsvq_lightning.commands import arguments as given
 from nsvq_lightning.commands import main as main_module
-from nsvq_lightning.commands.arguments import FIT_HELP
+from nsvq_lightning.commands.arguments import FIT_HELP, check_early
 from nsvq_lightning.commands.fit import SplatCLI, class_help
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.commands.registry import COMMANDS
@@ -216,6 +216,13 @@ def test_a_host_keeps_its_collector(monkeypatch: pytest.MonkeyPatch, collects: b
     finally:
         gc.unfreeze()
         gc.enable()
+
+
+def test_a_tilde_is_the_home_folder(make_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(make_scene().parent))
+    check_early(["fit", "--data.root=~/scene"])
+    with pytest.raises(FileNotFoundError, match=r"scene folder ~/other does not exist"):
+        check_early(["fit", "--data.root=~/other"])
 
 
 def test_commands_that_do_not_exist_or_contradict_themselves_are_told_so(capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,8 +18,9 @@ def write(root: Path, *names: str) -> None:
         (root / name).write_bytes(b"")
 
 
-def images(*names: str) -> list[ColmapImage]:
-    return [ColmapImage(name, 1, np.eye(4)) for name in names]
+def masks_of(root: Path, folder: str, *names: str) -> list[Path | None]:
+    photos = [ColmapImage(name, 1, np.eye(4)) for name in names]
+    return find_masks(photos, [root / "images" / name for name in names], root / "images", root, [folder])
 
 
 @pytest.mark.parametrize(
@@ -91,21 +92,20 @@ def test_masks_are_found_in_the_only_place_that_has_some(
 ) -> None:
     caplog.set_level("INFO", logger="nsvq_lightning")
     write(tmp_path, "images/1.jpg", "images/2.jpg", name.format("1"))
-    photos = images("1.jpg", "2.jpg")
-    assert find_masks(photos, tmp_path, ["masks"], tmp_path / "images") == [tmp_path / name.format("1"), None]
+    assert masks_of(tmp_path, "masks", "1.jpg", "2.jpg") == [tmp_path / name.format("1"), None]
     assert "masks are read from" in caplog.text or name.startswith("Masks")
     write(tmp_path, "more_masks/2.png")
-    assert find_masks(photos, tmp_path, ["masks"], tmp_path / "images") == [None, None]
+    assert masks_of(tmp_path, "masks", "1.jpg", "2.jpg") == [None, None]
     assert "are not used: choose a folder (--data.masks)" in caplog.text
-    assert find_masks(photos, tmp_path, ["more_masks"], tmp_path / "images") == [None, tmp_path / "more_masks/2.png"]
+    assert masks_of(tmp_path, "more_masks", "1.jpg", "2.jpg") == [None, tmp_path / "more_masks/2.png"]
 
 
 def test_masks_that_are_not_clear_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write(tmp_path, "images/1.jpg", "images/dynamic_mask_1.png")
-    assert find_masks(images("1.jpg"), tmp_path, ["masks"], tmp_path / "images") == [None]
+    assert masks_of(tmp_path, "masks", "1.jpg") == [None]
     assert "white leaves out in them" in caplog.text
-    assert find_masks(images("1.jpg"), tmp_path, ["missing"], tmp_path / "images") == [None]
+    assert masks_of(tmp_path, "missing", "1.jpg") == [None]
     assert "there is no folder" in caplog.text
     write(tmp_path, "masks/1.png", "masks/1.jpg")
     with pytest.raises(SceneError, match=r"1\.jpg and .*1\.png are masks of 1\.jpg: remove one"):
-        find_masks(images("1.jpg"), tmp_path, ["masks"], tmp_path / "images")
+        masks_of(tmp_path, "masks", "1.jpg")
