@@ -17,7 +17,6 @@ import shutil
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -304,29 +303,20 @@ def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
 
 def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     """Decode all photos, in parallel: whether that works, how much masks exclude, and which are not in the model."""
-    import torch
-
     from nsvq_lightning.data.reconstruct import PHOTOS
+    from nsvq_lightning.data.scene import unusable
 
-    def read(index: int) -> float | str:
-        """The share of a photo that counts, or why it cannot be used."""
-        try:
-            _, mask = scene.images.sources[index].load()
-        except (ValueError, OSError) as error:
-            return str(error)
-        return 1.0 if mask is None else float(mask.float().mean())
-
-    with ThreadPoolExecutor(max_workers=torch.get_num_threads()) as pool:
-        photos = dict(zip(scene.names, pool.map(read, range(len(scene))), strict=True))
-    broken = [photo for photo in photos.values() if isinstance(photo, str)]
+    count, broken = len(scene), unusable(scene)
     if broken:
-        yield Finding("problem", "photos", f"{len(broken)} of {len(photos)} cannot be used; first: {broken[0]}")
+        first = next(iter(broken.values()))
+        yield Finding("problem", "photos", f"{len(broken)} of {count} cannot be used; first: {first}")
     else:
-        yield judged("photos", f"all {len(photos)} registered photos can be read")
-    masked = {name: photo for name, photo in photos.items() if isinstance(photo, float) and photo < 1}
+        yield judged("photos", f"all {count} registered photos can be read")
+    masks = {scene.names[index]: scene.images[index].mask for index in range(count) if index not in broken}
+    masked = {name: float(mask.float().mean()) for name, mask in masks.items() if mask is not None}
     if masked:
         share = 1 - sum(masked.values()) / len(masked)
-        text = f"{len(masked)} of {len(photos)} photos have pixels that do not count, {100 * share:.0f} % of them"
+        text = f"{len(masked)} of {count} photos have pixels that do not count, {100 * share:.0f} % of them"
         most = min(masked, key=lambda name: masked[name])
         advice = f"most in {most}; masks are white where the photo counts; if not, invert them"
         yield judged("masks", text, share > 0.7 and advice)

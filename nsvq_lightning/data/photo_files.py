@@ -35,7 +35,8 @@ def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool 
     if len(exact) == len(paths):
         return [paths[name] for name in names]
     taken = {paths[name] for name in exact}
-    files = _Files(folder, (path for path in _photos_in(folder) if path not in taken), whole=bool(exact))
+    free = [path for path in _photos_in(folder) if path not in taken]
+    files = _Files(folder, free, whole=bool(exact))
     used: dict[Path, str] = {}
     for name in sorted(paths.keys() - exact):
         fitting = files.nearest(name)
@@ -48,6 +49,12 @@ def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool 
         if fitting[0] in used:
             raise SceneError(f"{source} names {used[fitting[0]]} and {name}, but there is only {fitting[0]}: copy both")
         used[fitting[0]] = name
+    stems = {path.with_suffix("") for path in taken | used.keys()}
+    others = {_kind(path.name) for path in free if path not in used and path.with_suffix("") in stems}
+    for path, name in list(used.items()):
+        if _kind(path.name) in others - {_kind(name)}:  # such as depth maps beside all photos, of which one is gone
+            paths[name] = folder / name
+            del used[path]
     for path, name in list(used.items())[:1]:
         log.info("%d of %d files have other names than in %s: %s is %s", len(used), len(paths), source, name, path)
     return [paths[name] for name in names]

@@ -266,13 +266,10 @@ def _image_sources(
     ]
 
 
-def usable(scene: Scene) -> Scene:
-    """The scene without train and test views of which there is no picture: damaged photos, and wholly masked ones.
+def unusable(scene: Scene) -> dict[int, SceneError]:
+    """Views of which there is no picture, and why: of damaged photos, and of wholly masked ones.
 
     All photos are decoded, and kept as far as the memory for them lasts.
-
-    Raises:
-        SceneError: No train or no test view is left.
     """
 
     def problem(index: int) -> SceneError | None:
@@ -283,13 +280,24 @@ def usable(scene: Scene) -> Scene:
         return None
 
     with ThreadPoolExecutor(usable_cores()) as pool:
-        problems = list(pool.map(problem, range(len(scene))))
-    wrong = [error for error in problems if error is not None]
-    train, test = (tuple(view for view in part if problems[view] is None) for part in (scene.train, scene.test))
-    if wrong and not (train and test):
-        raise wrong[0]
-    if wrong:
-        log.warning("left out %d of %d photos, first: %s", len(wrong), len(scene), wrong[0])
+        problems = enumerate(pool.map(problem, range(len(scene))))
+        return {index: error for index, error in problems if error is not None}
+
+
+def usable(scene: Scene) -> Scene:
+    """The scene without the train and test views that are :func:`unusable`; warns of them.
+
+    Raises:
+        SceneError: No train or no test view is left.
+    """
+    wrong = unusable(scene)
+    if not wrong:
+        return scene
+    first = next(iter(wrong.values()))
+    train, test = (tuple(view for view in part if view not in wrong) for part in (scene.train, scene.test))
+    if not train or not test:
+        raise first
+    log.warning("left out %d of %d photos, first: %s", len(wrong), len(scene), first)
     return replace(scene, train=train, test=test)
 
 

@@ -72,6 +72,16 @@ def test_a_photo_of_another_folder_is_not_taken_for_one_that_is_gone(tmp_path: P
     assert not locate(["a/1.jpg", "b/2.jpg"], tmp_path, "the model")[1].exists()
 
 
+@pytest.mark.parametrize("suffix", [".jpg", ".JPG"])
+def test_a_depth_map_is_not_taken_for_a_photo_that_is_gone(tmp_path: Path, suffix: str) -> None:
+    write(tmp_path, "1.jpg", "1.png", "2.png")
+    first, second = locate([f"1{suffix}", f"2{suffix}"], tmp_path, "the model")
+    assert first == tmp_path / "1.jpg"
+    assert not second.exists()
+    write(tmp_path / "scaled", "1.jpg", "2.png")  # here the suffix is that of all that there is
+    assert locate(["1.jpg", "2.jpg"], tmp_path / "scaled", "the model")[1] == tmp_path / "scaled/2.png"
+
+
 @pytest.mark.parametrize("place", [".", "input", "colmap/pictures", "sparse/0"])
 def test_the_only_folder_that_has_the_photos_is_used(tmp_path: Path, place: str) -> None:
     names = ["cam/1.jpg", "cam/2.jpg"]
