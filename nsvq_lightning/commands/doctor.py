@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
+from tqdm import tqdm
 
 from nsvq_lightning.commands import arguments as given
 
@@ -361,11 +362,11 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
     steps = phases.limited(fast["trainer"]["max_steps"], len(scene.train))
     all_steps, device = whole["trainer"]["max_steps"], best_device()
     parts = stretches(phases.schedule(steps), growth, round(wanted.start * budget), budget)
-    minutes = steps * iteration_seconds(scene, parts, device) / 60
-    hours = all_steps * iteration_seconds(scene, [(1.0, paper)], device) / 3600
+    recipes = tqdm([parts, [(1.0, paper)]], "timing steps of training", leave=False, disable=None)
+    step, paper_step = (iteration_seconds(scene, each, device) for each in recipes)
     most = round(growth.overshoot * budget)
-    text = f"about {minutes:.0f} min for fast.yaml ({steps:,} steps, up to {most:,} splats), "
-    text += f"{hours:.1f} h for the paper's run ({all_steps:,}, {paper:,}), on a machine as busy as now"
+    text = f"about {steps * step / 60:.0f} min for fast.yaml ({steps:,} steps, up to {most:,} splats), "
+    text += f"{all_steps * paper_step / 3600:.1f} h for the paper's run ({all_steps:,}, {paper:,}), on a machine as busy as now"
     yield judged("run time", text)
 
 

@@ -1,8 +1,8 @@
 """Find out where photos were taken from, by COLMAP, and make a scene of them that can be trained.
 
 Photos: 50 to 300, sharp, each overlapping the next by two thirds, zoom and exposure locked; they may lie in
-SCENE/images already. Of a video, the sharpest frames are taken, evenly spread. An interrupted run is continued by the
-same command.
+SCENE/images already, or in folders, one for each camera. Of a video, the sharpest frames are taken, evenly spread. An
+interrupted run is continued by the same command, and so is a scene to which photos were added.
 
 Examples:
   nsvq prepare photos/ scenes/garden
@@ -11,15 +11,20 @@ Examples:
 
 import argparse
 import json
+import shlex
 import shutil
 import sys
-from functools import partial
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from nsvq_lightning.commands.arguments import positive
 from nsvq_lightning.io.atomic import write_text
+
+if TYPE_CHECKING:
+    from nsvq_lightning.data.reconstruct import Report
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,6 +51,7 @@ def run(options: argparse.Namespace) -> int:
     """
     from nsvq_lightning.commands.doctor import check_folder, shown
     from nsvq_lightning.data import reconstruct
+    from nsvq_lightning.data.colmap import find_model
 
     source, scene = options.source, options.scene
     if not source.exists():
@@ -53,10 +59,10 @@ def run(options: argparse.Namespace) -> int:
     is_video = source.is_file() and source.suffix.lower() in reconstruct.VIDEOS
     if source.is_file() and not is_video:
         raise ValueError(f"{source}: neither a folder of photos nor a video ({', '.join(reconstruct.VIDEOS)})")
+    if not is_video:
+        photos, left = reconstruct.photos_in(source)  # before anything is written
     images = scene / "images"
     in_place = source.resolve() == images.resolve()
-    if not is_video:
-        reconstruct.photos_in(source)  # before anything is written
     _claim(options, is_video, in_place)
     bars: dict[str, tqdm] = {}
 
@@ -67,42 +73,64 @@ def run(options: argparse.Namespace) -> int:
         if done >= total:
             bars[step].close()
 
-    # The frames were complete before features were looked for.
-    if is_video and not (any(images.iterdir()) and (scene / "database.db").exists()):
-        for old in images.iterdir():
-            old.unlink()
-        total = reconstruct.frame_count(source)
-        show = partial(report, "choosing frames", total=total)
-        chosen = reconstruct.write_frames(source, images, options.frames, show)
-        sys.stdout.write(f"{len(chosen)} sharp frames of {total:,}\n")
-    elif not (is_video or in_place):
-        photos = reconstruct.photos_in(source)
-        show = partial(report, "copying photos", total=len(photos))
-        for path, reason in reconstruct.copy_photos(photos, images, show):
-            sys.stdout.write(f"left out: {path.name} cannot be read ({reason})\n")
-    names = [path.name for path in reconstruct.photos_in(images)]
+    left_out: list[str] = []
+    if is_video:
+        names = _frames(options, images, report)
+    else:
+        folder = source if in_place else images
+        names, closed = reconstruct.copy_photos(photos, source, folder, report)
+        left_out = [f"left out: {reconstruct.some(files)}: {reason}" for reason, files in (left | closed).items()]
+    _say(left_out)
     if len(names) < 2:
-        raise ValueError(f"{source}: {len(names)} pictures are too few; a scene takes 50 to 300")
+        few = f"{source}: {len(names)} pictures are too few, a scene takes 50 to 300"
+        raise ValueError("; ".join([few, *left_out]))
+    if find_model(source):
+        _say([f"{source} has cameras already: nsvq fit --data.root {shlex.quote(str(source))} uses them"])
+    _say(reconstruct.oddities(images, names))
+    before = {*reconstruct.stamps_in(scene), *reconstruct.stamps_in(scene / "sparse")}
     verdict = reconstruct.reconstruct(scene, names, report, is_video, options.max_size, options.threads)
-    sys.stdout.writelines(f"{line}\n" for line in verdict.told(images))
-    sys.stdout.write("\nchecking the scene; every photo is read once\n")
+    if not in_place:
+        for name in before.difference(names):
+            (images / name).unlink(missing_ok=True)
+    _say(verdict.told(images))
+    _say(["\nchecking the scene: every photo is read once, then steps of training are timed"])
     if shown(check_folder(scene))["problem"]:
         return 1
-    sys.stdout.write(f"\nnext: nsvq fit --data.root {scene}   (its database.db has served, and may be deleted)\n")
+    database = scene / reconstruct.DATABASE
+    size = database.stat().st_size / 1e6
+    _say([f"\n{database} ({size:.0f} MB) saves time when photos are added, and may be deleted"])
+    _say([f"next: nsvq fit --data.root {shlex.quote(str(scene))}"])
     return 0
 
 
-# File that shows that a folder was made by this command, and from what.
-RECORD = "prepare.json"
+def _say(lines: Iterable[str]) -> None:
+    sys.stdout.writelines(f"{line}\n" for line in lines)
+
+
+def _frames(options: argparse.Namespace, images: Path, report: "Report") -> list[str]:
+    """The names of the frames of a video, which are chosen unless that was done."""
+    from nsvq_lightning.data import reconstruct
+
+    names = sorted(path.name for path in images.glob("frame_*.jpg"))
+    # They were complete before features were looked for.
+    if names and (options.scene / reconstruct.DATABASE).exists():
+        return names
+    for name in names:
+        (images / name).unlink()
+    names = reconstruct.write_frames(options.source, images, options.frames, report)
+    _say([f"{len(names)} sharp frames"])
+    return names
 
 
 def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
     """Take the folder of the scene; what another preparation has left in it is continued."""
+    from nsvq_lightning.data import reconstruct
+
     scene: Path = options.scene
     record = {"source": str(options.source.resolve()), "max_size": options.max_size}
     if is_video:
         record["frames"] = options.frames
-    path, own = scene / RECORD, {"images"} if in_place else set()
+    path, own = scene / reconstruct.RECORD, {"images"} if in_place else set()
     if path.is_file() and not options.again:
         found = json.loads(path.read_text(encoding="utf-8"))
         if found != record:
@@ -110,7 +138,8 @@ def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
     elif scene.is_dir() and not path.is_file() and {each.name for each in scene.iterdir()} - own:
         raise ValueError(f"{scene} is not empty and was not made by this command: name a new folder")
     if options.again and path.is_file():
-        made = {"images", "sparse", "mapping", "database.db", "database.db-shm", "database.db-wal", RECORD}
+        reconstruct.remove_database(scene)
+        made = {"images", "sparse", "mapping", reconstruct.STAMPS, reconstruct.RECORD}
         for target in (scene / name for name in made - own):
             shutil.rmtree(target) if target.is_dir() else target.unlink(missing_ok=True)
     (scene / "images").mkdir(parents=True, exist_ok=True)

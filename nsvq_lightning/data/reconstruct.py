@@ -1,13 +1,20 @@
 """Photos and frames of a video, and where they were taken from: COLMAP, in steps that can be continued."""
 
 import contextlib
+import importlib
+import io
 import itertools
+import json
+import os
+import re
 import shutil
 import sqlite3
 import threading
-from collections import Counter, defaultdict
+import zlib
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +26,7 @@ from cv2.typing import MatLike
 
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
 from nsvq_lightning.data.images import DAMAGED, ORIENTATION, image_head, read_image
-from nsvq_lightning.io.atomic import atomic_write, write_bytes
+from nsvq_lightning.io.atomic import write_bytes, write_text
 
 
 @dataclass(frozen=True)
@@ -74,6 +81,8 @@ class Verdict:
 
 # Photos below which a scene is likely to look good only from where they were taken.
 MIN_PHOTOS = 20
+# Files in a scene: what of it was made; features and matches; which photos were used.
+RECORD, DATABASE, STAMPS = "prepare.json", "database.db", "photos.json"
 # Called with a step, how much of it is done, and how much there is.
 Report = Callable[[str, int, int], None]
 
@@ -83,12 +92,12 @@ def reconstruct(
 ) -> Verdict:
     """Find the cameras of the photos in ``scene/images`` and write them to ``scene/sparse/0``.
 
-    Photos of one size are taken to be from one camera with a fixed zoom. What a call that was stopped has found is
-    used by the next one.
+    Photos of one folder, size and lens are taken to be from one camera with a fixed zoom. What an earlier call has
+    found in the same photos is used again; a model of others stays until it can be replaced.
 
     Args:
         scene: Folder of the scene.
-        names: Files in ``scene/images``.
+        names: Files in ``scene/images``, with ``/`` in those of its subfolders.
         report: Where to say how far it is.
         is_video: Whether they are frames in order.
         max_size: Longer side in pixels to which photos are reduced for finding features.
@@ -100,18 +109,17 @@ def reconstruct(
     for name in (str(scene.resolve()), *names):
         check_name(name, "the scene to prepare", allow_outside=True)
     pycolmap = import_pycolmap()
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     pycolmap.set_random_seed(0)
-    database, images = scene / "database.db", scene / "images"
-    _extract(database, images, names, report, max_size, threads)
+    database, images = scene / DATABASE, scene / "images"
+    stamps = _extract(database, images, names, report, max_size, threads)
     _compare(database, len(names), report, is_video, threads)
-    models = _map(database, scene, len(names), report, threads)
-    common = _partners(database)
+    models = _map(database, scene, stamps, report, threads)
+    common = dict(_rows(database, _PARTNERS, json.dumps(names)))
     if not models:
-        raise SceneError(
-            f"{scene}: no two photos show enough of the same things from different places; each should overlap the "
-            f"next by two thirds, be sharp, and show texture. Photos with a partner: {len(common)} of {len(names)}"
-        )
+        why = "; ".join(oddities(images, names)) or _NOTHING_IN_COMMON
+        kept = "; the scene of before is as it was" if (scene / "sparse").is_dir() else ""
+        raise SceneError(f"{scene}: {why}. Photos with a partner: {len(common)} of {len(names)}{kept}")
     model = models[0]
     registered = _registered(model)
     return Verdict(
@@ -124,19 +132,55 @@ def reconstruct(
     )
 
 
-# Photos of one size from which on their camera has a lens model of four numbers, not one.
+_NOTHING_IN_COMMON = (
+    "no two photos show enough of the same things from different places; each should overlap the next by two thirds, "
+    "be sharp, and show texture"
+)
+
+
+def oddities(images: Path, names: Sequence[str]) -> Iterator[str]:
+    """What is unusual about photos and makes it unlikely that their cameras are found.
+
+    Args:
+        images: Folder of the photos.
+        names: Their names in it.
+    """
+    if len(names) <= 3:
+        yield f"{len(names)} photos are hardly enough for a scene: take 50 to 300 from different places"
+    wide = [name for name in names if Fraction(*image_head(images / name).size) == 2]
+    if 2 * len(wide) > len(names):
+        yield (
+            f"{some(wide)} are twice as wide as high: 360° panoramas must be cut into ordinary views first, for "
+            "example with 'ffmpeg -i panorama.jpg -vf v360=e:flat:yaw=90 view.jpg' for each direction"
+        )
+
+
+# Photos of one camera from which on it has a lens model of four numbers, not one.
 SHARED = 8
 
 
-def _extract(database: Path, images: Path, names: Sequence[str], report: Report, max_size: int, threads: int) -> None:
+def _extract(
+    database: Path, images: Path, names: Sequence[str], report: Report, max_size: int, threads: int
+) -> dict[str, str]:
+    """Find features in photos that have none yet; returns the stamp of each photo."""
     pycolmap = import_pycolmap()
-    groups: defaultdict[tuple[int, int], list[str]] = defaultdict(list)
+    groups: defaultdict[Any, list[str]] = defaultdict(list)
     for name in names:
-        groups[image_head(images / name).size].append(name)
+        groups[_camera_of(images / name)].append(name)
+    stamps = {}
+    for group in groups.values():
+        model = "OPENCV" if len(group) >= SHARED else "SIMPLE_RADIAL"
+        for name in group:
+            stamps[name] = f"{model} {zlib.crc32((images / name).read_bytes()):08x}"
+    known = stamps_in(images.parent)
+    if any(known.get(name, stamp) != stamp for name, stamp in stamps.items()):
+        remove_database(images.parent)
+    # With those of photos that have gone, whose features stay in the database; they may come back.
+    write_text(images.parent / STAMPS, json.dumps(known | stamps))
     options = pycolmap.FeatureExtractionOptions(max_image_size=max_size, num_threads=threads, use_gpu=False)
     done = 0
     for group in groups.values():
-        reader = pycolmap.ImageReaderOptions(camera_model="OPENCV" if len(group) >= SHARED else "SIMPLE_RADIAL")
+        reader = pycolmap.ImageReaderOptions(camera_model=stamps[group[0]].split()[0])
         # The first one alone makes the camera of its group. COLMAP passes over photos that have features already.
         for batch in (group[:1], *(group[start : start + 4] for start in range(1, len(group), 4))):
             cameras = dict(_rows(database, "select name, camera_id from images"))
@@ -152,6 +196,35 @@ def _extract(database: Path, images: Path, names: Sequence[str], report: Report,
             )
             done += len(batch)
             report("finding features", done, len(names))
+    return stamps
+
+
+# EXIF tags: model of a camera; the part on how a photo was taken; in that, focal length, and what it would be on film.
+MODEL, HOW, FOCAL, FOCAL_ON_FILM = 272, 34665, 37386, 41989
+
+
+def _camera_of(path: Path) -> tuple[object, ...]:
+    """What photos of one camera have in common: folder, size, and what EXIF says of camera and lens."""
+    with PIL.Image.open(path) as image:
+        # Pillow decodes a whole PNG to look for it elsewhere.
+        tags = PIL.Image.Exif()
+        tags.load(image.info.get("exif", b""))
+    how = tags.get_ifd(HOW)
+    lens = [tags.get(MODEL), how.get(FOCAL), how.get(FOCAL_ON_FILM)]
+    # As text: the number 0/0, which some write, is not equal to itself.
+    return path.parent, image_head(path).size, str(lens)
+
+
+def stamps_in(folder: Path) -> dict[str, str]:
+    """What the features or models in a folder were found in: for each photo lens model and checksum."""
+    path = folder / STAMPS
+    return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
+
+
+def remove_database(scene: Path) -> None:
+    """Remove features and matches, with what a killed process has left of them."""
+    for path in scene.glob(f"{DATABASE}*"):
+        path.unlink()
 
 
 # Photos up to which every pair is compared; frames of a video are compared with those near them from half of it on.
@@ -189,15 +262,17 @@ def _compare(database: Path, count: int, report: Report, is_video: bool, threads
     report("comparing photos", pairs, pairs)
 
 
-def _map(database: Path, scene: Path, count: int, report: Report, threads: int) -> list[Any]:
-    """The models, the largest first, which are then in ``scene/sparse``."""
+def _map(database: Path, scene: Path, stamps: dict[str, str], report: Report, threads: int) -> list[Any]:
+    """The models, the largest first, which are then in ``scene/sparse``; one of other photos there is replaced."""
     pycolmap = import_pycolmap()
     work, sparse = scene / "mapping", scene / "sparse"
-    if not (sparse / "0").is_dir():
+    if stamps_in(sparse) != stamps:
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir()
         placed = itertools.count(1)
+        count = len(stamps)
         options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=0, min_model_size=3)
+        options.image_names = list(stamps)
         found = pycolmap.incremental_mapping(
             database,
             scene / "images",
@@ -213,6 +288,8 @@ def _map(database: Path, scene: Path, count: int, report: Report, threads: int) 
         for index, model in enumerate(ordered):
             (work / str(index)).mkdir(parents=True)
             model.write(work / str(index))
+        write_text(work / STAMPS, json.dumps(stamps))
+        shutil.rmtree(sparse, ignore_errors=True)
         work.rename(sparse)
     folders = sorted((path for path in sparse.iterdir() if path.name.isdecimal()), key=lambda path: int(path.name))
     return [pycolmap.Reconstruction(folder) for folder in folders]
@@ -234,83 +311,142 @@ def _registered(model: Any) -> set[str]:
     return {image.name for image in model.images.values() if image.has_pose}
 
 
-def _partners(database: Path) -> dict[str, int]:
-    """For each photo by name, the number of others that it shares enough points with; none are left out."""
-    names = dict(_rows(database, "select image_id, name from images"))
-    pairs = _rows(database, "select pair_id from two_view_geometries where rows >= 15")
-    numbers = (number for (pair,) in pairs for number in (pair % 2147483647, pair // 2147483647))
-    return Counter(names[number] for number in numbers if number in names)
+# Photos by name, and how many of them share enough points with each; COLMAP numbers a pair by its images' numbers.
+_PARTNERS = """
+    with photos as (select * from images where name in (select value from json_each(?)))
+    select one.name, count(*) from photos one join photos other join two_view_geometries
+    on pair_id = 2147483647 * min(one.image_id, other.image_id) + max(one.image_id, other.image_id)
+    where one.image_id != other.image_id and rows >= 15 group by one.name
+"""
 
 
-def _rows(database: Path, query: str) -> list[tuple[Any, ...]]:
+def _rows(database: Path, query: str, *parameters: str) -> list[tuple[Any, ...]]:
     """What a query finds in a database; nothing where there is none."""
     if not database.exists():
         return []
-    with contextlib.closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as connection:
-        return connection.execute(query).fetchall()
+    with contextlib.closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=rw", uri=True)) as connection:
+        return connection.execute(query, parameters).fetchall()
 
 
 # Suffixes of photos that both COLMAP and this package read.
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+# Suffixes of those that are converted if Pillow reads them, and of raw files.
+CONVERTED = (".jfif", ".jpe", ".avif", ".heic", ".heif", ".hif", ".jxl", ".jp2", ".gif")
+RAW = (".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 # Suffixes of videos.
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+# Names of folders that hold something else than photos, or the same photos again.
+OTHER = re.compile(r"\..*|__MACOSX|(.*_)?(masks?|depths?|normals?)|\.?thumb.*|images_\d+|sparse|runs", re.IGNORECASE)
+# Names of files, by the reason why they are left out.
+LeftOut = dict[str, list[str]]
 
 
-def photos_in(folder: Path) -> list[Path]:
-    """The photos of a folder, sorted by name.
+def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
+    """The photos of a folder, or if it has none those of the folders in it, and what is left out.
+
+    Of files that differ in the suffix alone, such as the JPEG and the raw file of a camera, one is taken.
 
     Raises:
-        SceneError: There are none, or some in a format that must be converted first.
+        SceneError: There are none.
     """
-    files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    must_convert = (".heic", ".heif", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".dng")
-    closed = [path.name for path in files if path.suffix.lower() in must_convert]
-    if closed:
-        raise SceneError(
-            f"{folder}: {closed[0]} and {len(closed) - 1} more cannot be read: convert them to JPEG first, for example "
-            f"with 'magick mogrify -format jpg *{Path(closed[0]).suffix}', or set the phone to \"most compatible\""
-        )
-    photos = [path for path in files if path.suffix.lower() in PHOTOS]
-    if not photos:
-        inside = next((path.parent for path in sorted(folder.glob("*/*")) if path.suffix.lower() in PHOTOS), None)
-        advice = f"it must hold files that end in {', '.join(PHOTOS)}"
-        if inside is not None:
-            advice = f"there are some in {inside}: give that folder"
-        raise SceneError(f"{folder}: no photos; {advice}")
-    return photos
+    suffixes = PHOTOS + CONVERTED + RAW
+    files = [path for path in folder.rglob("[!.]*") if path.suffix.lower() in suffixes and path.is_file()]
+    files.sort(key=lambda path: (path.parent != folder, suffixes.index(path.suffix.lower()), path))
+    taken: dict[str, Path] = {}
+    left: LeftOut = defaultdict(list)
+    for path in files:
+        inside = path.relative_to(folder)
+        if any((folder / parent / RECORD).is_file() for parent in inside.parents[:-1]):
+            continue  # a scene, made of photos that are here
+        if path.parent != files[0].parent == folder:
+            left["in a folder beside the photos: give it alone, or put all photos into folders"].append(str(inside))
+        elif any(map(OTHER.fullmatch, inside.parts[:-1])):
+            left["no photos by the name of their folder"].append(str(inside))
+        elif taken.setdefault(str(inside.with_suffix("")).casefold(), path) != path:
+            left["another file of that name is taken"].append(str(inside))
+    if not taken:
+        raise SceneError(f"{folder}: no photos; it must hold files that end in {', '.join(PHOTOS)}, or folders of them")
+    return sorted(taken.values()), left
 
 
-JPEG_QUALITY = 95
+def copy_photos(photos: Sequence[Path], source: Path, folder: Path, report: Report) -> tuple[list[str], LeftOut]:
+    """Copy photos into a folder, upright and as files that COLMAP reads; copies that are there already stay.
 
-
-def copy_photos(photos: Sequence[Path], folder: Path, done: Callable[[int], None]) -> list[tuple[Path, str]]:
-    """Copy photos into a folder, those with an EXIF orientation turned upright; copies that are there already stay.
+    Photos that lie in that folder already are only converted if COLMAP cannot read them.
 
     Args:
         photos: The files.
+        source: The folder that they, or the folders with them, are in.
         folder: Where to, existing.
-        done: Called with how many have been treated.
+        report: Where to say how far it is.
 
     Returns:
-        Photos that cannot be read, and why; they are not copied.
+        The names of the copies in ``folder``, and which photos cannot be read.
     """
-    damaged = []
+    names: list[str] = []
+    left: LeftOut = defaultdict(list)
     for count, path in enumerate(photos, 1):
-        target = folder / path.name
+        inside = path.relative_to(source)
         try:
-            with PIL.Image.open(path) as image:
-                image.load()
-                if not target.exists():
-                    with atomic_write(target) as copy:
-                        if image.getexif().get(ORIENTATION, 1) == 1:
-                            copy.write(path.read_bytes())
-                        else:
-                            upright = PIL.ImageOps.exif_transpose(image)
-                            upright.save(copy, image.format, quality=JPEG_QUALITY, exif=upright.getexif().tobytes())
+            names.append(_copy(path, folder / inside).relative_to(folder).as_posix())
         except DAMAGED as error:
-            damaged.append((path, str(error)))
-        done(count)
-    return damaged
+            known = path.suffix.lower() in PHOTOS
+            left[f"cannot be read ({error})" if known else TO_CONVERT].append(str(inside))
+        report("copying photos", count, len(photos))
+    return names, left
+
+
+TO_CONVERT = (
+    "cannot be read: convert to JPEG, for example with 'magick mogrify -format jpg *.heic', or set the phone to \"most "
+    "compatible\"; HEIC is read after 'pip install pillow-heif'"
+)
+JPEG_QUALITY = 95
+# What Pillow calls the formats that COLMAP reads, and those of converted photos that stay without losses.
+COLMAP_READS, LOSSLESS = ("JPEG", "MPO", "PNG", "TIFF", "BMP"), ("PNG", "TIFF", "BMP")
+
+
+def _copy(path: Path, target: Path) -> Path:
+    """Copy a photo to ``target``, whose suffix may change; returns where it is."""
+    with contextlib.suppress(ImportError):
+        importlib.import_module("pillow_heif").register_heif_opener()
+    in_place = path == target
+    with PIL.Image.open(path) as image:
+        if image.format == "TIFF" and path.suffix.lower() not in PHOTOS:
+            raise ValueError("the preview in a raw file")
+        is_plain = image.getexif().get(ORIENTATION, 1) == 1 and image.mode[0] not in "IF"
+        as_is = image.format in COLMAP_READS and (in_place or is_plain)
+        is_lossless = image.format in LOSSLESS or image.has_transparency_data
+        kind, suffixes = ("PNG", (".png",)) if is_lossless else ("JPEG", (".jpg", ".jpeg"))
+        if path.suffix.lower() not in (PHOTOS if as_is else suffixes):
+            target = target.with_suffix(suffixes[0])
+        if not in_place and target.exists() and target.stat().st_mtime == path.stat().st_mtime:
+            return target
+        image.load()
+        content = path.read_bytes() if as_is else _converted(image, path, kind)
+    if target != path:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(target, content)
+        os.utime(target, ns=(path.stat().st_atime_ns, path.stat().st_mtime_ns))
+    elif not as_is:
+        raise ValueError("it is of another format than its name says: rename it")
+    return target
+
+
+def _converted(image: PIL.Image.Image, path: Path, kind: str) -> bytes:
+    """A photo upright and in 8 bits, as a file of another kind."""
+    if image.mode[0] in "IF":  # 16 bits or more, which Pillow would cut off
+        image = PIL.Image.fromarray(read_image(path))
+    upright = PIL.ImageOps.exif_transpose(image)
+    colours = upright.convert("RGBA" if upright.has_transparency_data else "RGB")
+    file = io.BytesIO()
+    colours.save(file, kind, quality=JPEG_QUALITY, exif=upright.getexif().tobytes())
+    return file.getvalue()
+
+
+def some(names: Sequence[str]) -> str:
+    """The first of many names, and how many more there are."""
+    shown = ", ".join(names[:8])
+    return f"{shown} and {len(names) - 8} more" if len(names) > 8 else shown
 
 
 def sharpness(picture: MatLike) -> float:
@@ -325,43 +461,42 @@ def sharpness(picture: MatLike) -> float:
 STILL = 2.0
 
 
-def write_frames(video: Path, folder: Path, count: int, done: Callable[[int], None]) -> list[Path]:
+def write_frames(video: Path, folder: Path, count: int, report: Report) -> list[str]:
     """Write the sharpest frame of each of ``count`` equal parts of a video as a JPEG; still parts are left out.
 
     Args:
         video: The file; OpenCV turns its frames upright.
         folder: Where to, existing.
         count: Number of parts.
-        done: Called with the number of frames that have been read.
+        report: Where to say how far it is.
 
     Returns:
-        The pictures, named after the frames, in order.
+        The names of the pictures, after the numbers of the frames.
 
     Raises:
         SceneError: The file is not a video that can be read.
     """
-    total = frame_count(video)
+    total = _frame_count(video)
     parts = min(count, total)
-    written: list[Path] = []
+    names: list[str] = []
     last: MatLike | None = None
-    for _, part in itertools.groupby(_frames(video, done), key=lambda frame: frame[0] * parts // total):
+
+    def show(done: int) -> None:
+        report("choosing frames", done, total)
+
+    for _, part in itertools.groupby(_frames(video, show), key=lambda frame: frame[0] * parts // total):
         number, picture = max(part, key=lambda frame: sharpness(frame[1]))
         tiny = cv2.resize(picture, (48, 27), interpolation=cv2.INTER_AREA).astype(np.float32)
         if last is not None and float(np.abs(tiny - last).mean()) < STILL:
             continue
-        path = folder / f"frame_{number:06d}.jpg"
-        write_bytes(path, cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
-        written.append(path)
+        names.append(f"frame_{number:06d}.jpg")
+        written = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+        write_bytes(folder / names[-1], written.tobytes())
         last = tiny
-    return written
+    return names
 
 
-def frame_count(video: Path) -> int:
-    """Number of frames of a video.
-
-    Raises:
-        SceneError: The file is not a video that can be read.
-    """
+def _frame_count(video: Path) -> int:
     reader = cv2.VideoCapture(str(video))
     total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
     reader.release()

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
+from tqdm import tqdm
 
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.compute.environment import usable_cores
@@ -280,7 +281,9 @@ def unusable(scene: Scene) -> dict[int, SceneError]:
         return None
 
     with ThreadPoolExecutor(usable_cores()) as pool:
-        problems = enumerate(pool.map(problem, range(len(scene))))
+        problems = enumerate(
+            tqdm(pool.map(problem, range(len(scene))), "photos", len(scene), leave=False, disable=None)
+        )
         return {index: error for index, error in problems if error is not None}
 
 

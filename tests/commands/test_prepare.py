@@ -78,11 +78,65 @@ def test_photos_may_lie_in_their_place(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_photos_of_nothing_in_common_are_told(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for seed in range(3):
+    for seed in range(4):
         _noise(photos / f"{seed}.png", seed)
     said = _fails(capsys, photos, tmp_path / "scene")
     assert "no two photos show enough of the same things" in said
+    assert "Photos with a partner: 0 of 4" in said
+    (photos / "3.png").unlink()
+    said = _fails(capsys, photos, tmp_path / "scene")
+    assert "3 photos are hardly enough" in said
+    assert "of the same things" not in said
     assert "Photos with a partner: 0 of 3" in said
+
+
+def test_photos_that_cannot_be_read_are_told(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a.HEIC", "b.nef", "c.jxl"):
+        (photos / name).write_bytes(b"x")
+    said = _fails(capsys, photos, tmp_path / "scene")
+    assert "0 pictures are too few, a scene takes 50 to 300; left out: a.HEIC, b.nef, c.jxl: cannot be read: " in said
+    assert "convert to JPEG" in said
+    for seed in range(4):
+        _noise(photos / f"{seed}.png", seed)
+    assert main(["prepare", str(photos), str(tmp_path / "scene")]) == 1
+    assert "left out: a.HEIC, b.nef, c.jxl: cannot be read" in capsys.readouterr().out
+
+
+def test_photos_are_added_and_leave_by_the_same_command(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, found = tmp_path / "scene", []
+
+    def fake(scene: Path, names: list[str], *_: object) -> reconstruct.Verdict:
+        (scene / "database.db").touch()
+        (scene / "photos.json").write_text(json.dumps(dict.fromkeys(names, "")))
+        if "odd.png" in names:
+            raise ValueError("no place")
+        found.append(names)
+        (scene / "sparse").mkdir(exist_ok=True)
+        shutil.copy(scene / "photos.json", scene / "sparse")
+        return reconstruct.Verdict(tuple(names), {}, 1, 0.1, 2.0, 1)
+
+    monkeypatch.setattr(reconstruct, "reconstruct", fake)
+    monkeypatch.setattr("nsvq_lightning.commands.doctor.check_folder", lambda _: iter(()))
+
+    def copies() -> list[str]:
+        return sorted(path.name for path in (scene / "images").iterdir())
+
+    for name in ("a", "b", "c"):
+        _noise(photos / f"{name}.png")
+    assert main(["prepare", str(photos), str(scene)]) == 0
+    (scene / "images/mine.png").write_bytes(b"of the user")
+    (photos / "c.png").unlink()
+    _noise(photos / "odd.png")
+    assert "no place" in _fails(capsys, photos, scene)
+    assert copies() == ["a.png", "b.png", "c.png", "mine.png", "odd.png"]  # what the scene of before needs, too
+    (photos / "odd.png").rename(photos / "d.png")
+    assert main(["prepare", str(photos), str(scene)]) == 0
+    assert found == [["a.png", "b.png", "c.png"], ["a.png", "b.png", "d.png"]]
+    assert copies() == ["a.png", "b.png", "d.png", "mine.png"]
+    said = capsys.readouterr().out
+    assert "database.db (0 MB) saves time when photos are added, and may be deleted" in said
 
 
 def test_a_model_whose_photos_are_all_in_a_larger_one_is_left_out() -> None:
@@ -131,3 +185,9 @@ def test_cameras_are_found_and_a_killed_run_continues(
     assert np.abs(sides[0] - scale * sides[1]).max() < 0.02 * sides[0].max()
     assert main(["prepare", str(photos), str(scene)]) == 0
     assert "12 of 13 photos" in capsys.readouterr().out
+    shutil.copy(made / "images/view_012.png", photos)
+    (photos / "zz_odd.png").unlink()
+    assert main(["prepare", str(photos), str(scene)]) == 0
+    assert "13 of 13 photos have found their place" in capsys.readouterr().out
+    assert load_scene(scene).names == true.names[:13]
+    assert not (scene / "images/zz_odd.png").exists()

@@ -8,14 +8,28 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from nsvq_lightning.data.colmap import SceneError
+from nsvq_lightning.data import reconstruct
+from nsvq_lightning.data.colmap import SceneError, import_pycolmap
 from nsvq_lightning.data.images import image_head, read_image
-from nsvq_lightning.data.reconstruct import copy_photos, photos_in, sharpness, write_frames
+from nsvq_lightning.data.reconstruct import copy_photos, oddities, photos_in, sharpness, some, stamps_in, write_frames
 
 
 def _texture(shift: int = 0) -> np.ndarray[Any, Any]:
     noise = np.random.default_rng(4).integers(0, 255, (24, 48, 3), dtype=np.uint8)
     return np.roll(cv2.resize(noise, (192, 96), interpolation=cv2.INTER_NEAREST), shift, axis=1)
+
+
+def _silent(step: str, done: int, total: int) -> None:
+    pass
+
+
+def _copied(source: Path, target: Path) -> list[str]:
+    """The names of the copies of all photos; none is left out."""
+    photos, left = photos_in(source)
+    names, closed = copy_photos(photos, source, target, _silent)
+    assert not left
+    assert not closed
+    return names
 
 
 def _video(path: Path, pictures: list[np.ndarray[Any, Any]]) -> Path:
@@ -30,12 +44,13 @@ def _video(path: Path, pictures: list[np.ndarray[Any, Any]]) -> Path:
 def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
     sharp = {2, 11, 17, 20}
     pictures = [_texture(9 * k) if k in sharp else cv2.GaussianBlur(_texture(9 * k), None, 3) for k in range(24)]
-    seen: list[int] = []
-    found = write_frames(_video(tmp_path / "a.mp4", pictures), tmp_path, 4, seen.append)
-    assert [path.name for path in found] == [f"frame_{k:06d}.jpg" for k in sorted(sharp)]
-    assert seen == list(range(1, 25))
-    for path, index in zip(found, sorted(sharp), strict=True):
-        difference = read_image(path)[:, :, ::-1].astype(int) - pictures[index]
+    seen: list[tuple[int, int]] = []
+    video = _video(tmp_path / "a.mp4", pictures)
+    found = write_frames(video, tmp_path, 4, lambda _, done, total: seen.append((done, total)))
+    assert found == [f"frame_{k:06d}.jpg" for k in sorted(sharp)]
+    assert seen == [(k, 24) for k in range(1, 25)]
+    for name, index in zip(found, sorted(sharp), strict=True):
+        difference = read_image(tmp_path / name)[:, :, ::-1].astype(int) - pictures[index]
         assert np.abs(difference).mean() < 30  # chroma has half the resolution
 
 
@@ -44,13 +59,13 @@ def test_still_parts_are_left_out_and_short_videos_give_what_they_have(
     tmp_path: Path, shifts: list[int], parts: int, frames: int
 ) -> None:
     video = _video(tmp_path / "a.mp4", [_texture(shift) for shift in shifts])
-    assert len(write_frames(video, tmp_path, parts, lambda _: None)) == frames
+    assert len(write_frames(video, tmp_path, parts, _silent)) == frames
 
 
 def test_what_is_no_video_is_told(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(b"nothing")
     with pytest.raises(SceneError, match=r"a\.mp4: no frame can be read; convert it"):
-        write_frames(tmp_path / "a.mp4", tmp_path, 10, lambda _: None)
+        write_frames(tmp_path / "a.mp4", tmp_path, 10, _silent)
 
 
 @pytest.fixture
@@ -60,8 +75,9 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path / "from", tmp_path / "to"
 
 
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
-def test_photos_are_turned_upright(folders: tuple[Path, Path], orientation: int) -> None:
+def test_photos_are_turned_upright(folders: tuple[Path, Path], orientation: int, suffix: str) -> None:
     upright = np.zeros((32, 64, 3), np.uint8)
     upright[:, :32, 0] = 255  # red on the left
     turns = {1: 0, 3: 2, 6: 1, 8: 3}[orientation]
@@ -70,14 +86,72 @@ def test_photos_are_turned_upright(folders: tuple[Path, Path], orientation: int)
     exif[0x0112] = orientation
     exif[0x010F] = "maker"
     source, target = folders
-    PIL.Image.fromarray(np.ascontiguousarray(stored)).save(source / "a.jpg", quality=95, exif=exif)
-    assert copy_photos(photos_in(source), target, lambda _: None) == []
-    assert image_head(target / "a.jpg").size == (64, 32)
-    assert np.abs(read_image(target / "a.jpg").astype(int) - upright).mean() < 5
-    with PIL.Image.open(target / "a.jpg") as image:
+    PIL.Image.fromarray(np.ascontiguousarray(stored)).save(source / f"a.{suffix}", quality=95, exif=exif)
+    (name,) = _copied(source, target)
+    assert image_head(target / name).size == (64, 32)
+    assert np.abs(read_image(target / name).astype(int) - upright).mean() < 5
+    with PIL.Image.open(target / name) as image:
         assert image.getexif().get(0x0112, 1) == 1
-        assert image.getexif()[0x010F] == "maker"
-    assert (orientation == 1) == ((target / "a.jpg").read_bytes() == (source / "a.jpg").read_bytes())
+        assert image.getexif().get(0x010F, "maker") == "maker"  # Pillow loses the tags of a TIFF that it turns
+    if suffix != "webp":
+        as_it_was = (target / name).read_bytes() == (source / f"a.{suffix}").read_bytes()
+        assert as_it_was == (orientation == 1)
+
+
+def _written(path: Path) -> np.ndarray[Any, Any]:
+    """Write a photo in the format that its name says; returns its pixels."""
+    pixels = cv2.resize(_texture(), (96, 48), interpolation=cv2.INTER_AREA)
+    pixels = cv2.GaussianBlur(pixels, None, 3)
+    if path.stem == "deep":
+        pixels = np.repeat(pixels[..., :1], 3, axis=2)
+        cv2.imwrite(str(path), pixels[..., 0].astype(np.uint16) * 257)
+    elif path.stem == "clear":
+        image = PIL.Image.fromarray(pixels).convert("RGBA")
+        image.putpixel((0, 0), (0, 0, 0, 100))
+        image.save(path, quality=95)
+    elif path.stem == "misnamed":
+        PIL.Image.fromarray(pixels).save(path, "WEBP", quality=95)
+    elif path.stem == "grey":
+        pixels = np.repeat(pixels[..., :1], 3, axis=2)
+        PIL.Image.fromarray(pixels[..., 0]).save(path, quality=95)
+    elif path.stem == "print":
+        PIL.Image.fromarray(pixels).convert("CMYK").save(path, quality=95)
+    else:
+        PIL.Image.fromarray(pixels).save(path, "JPEG" if path.suffix == ".jfif" else None, quality=95)
+    return pixels
+
+
+@pytest.mark.parametrize(
+    ("name", "copy"),
+    [
+        ("a.WEBP", "a.jpg"),
+        ("a.avif", "a.jpg"),
+        ("a.gif", "a.jpg"),
+        ("a.jp2", "a.jpg"),
+        ("a.jfif", "a.jpg"),
+        ("misnamed.jpg", "misnamed.jpg"),
+        ("clear.webp", "clear.png"),
+        ("deep.png", "deep.png"),
+        ("deep.tif", "deep.png"),
+        ("a.bmp", "a.bmp"),
+        ("print.jpg", "print.jpg"),
+        ("grey.PNG", "grey.PNG"),
+        ("grey.jpg", "grey.jpg"),
+        ("ein Bild ü.JPEG", "ein Bild ü.JPEG"),
+    ],
+)
+def test_what_is_copied_can_be_read_by_colmap(folders: tuple[Path, Path], name: str, copy: str) -> None:
+    """The pixels as written are the oracle, of COLMAP's reader and of ours."""
+    source, target = folders
+    try:
+        pixels = _written(source / name).astype(int)
+    except (KeyError, ValueError):
+        pytest.skip("this Pillow does not write it")
+    assert _copied(source, target) == [copy]
+    seen = import_pycolmap().Bitmap.read(target / copy, True).to_array()[..., :3]
+    assert np.abs(seen.astype(int) - pixels).mean() < 4
+    assert np.abs(read_image(target / copy).astype(int) - pixels).mean() < 4
+    assert image_head(target / copy).has_alpha == name.startswith("clear")
 
 
 def test_damaged_photos_are_named_and_left_out(folders: tuple[Path, Path]) -> None:
@@ -85,19 +159,177 @@ def test_damaged_photos_are_named_and_left_out(folders: tuple[Path, Path]) -> No
     PIL.Image.fromarray(_texture()).save(source / "a.png")
     (source / "b.jpg").write_bytes((source / "a.png").read_bytes()[:200])
     (source / "notes.txt").write_text("no photo")
+    PIL.Image.fromarray(_texture().astype(np.float32)[..., 0]).save(source / "depth.tif")
+    PIL.Image.fromarray(_texture()).save(source / "preview.dng", "TIFF")
     steps: list[int] = []
-    ((path, _),) = copy_photos(photos_in(source), target, steps.append)
-    assert path.name == "b.jpg"
+    names, left = copy_photos(photos_in(source)[0], source, target, lambda _, done, total: steps.append(done))
+    assert names == ["a.png"]
+    reasons = {name: reason for reason, files in left.items() for name in files}
+    assert set(reasons) == {"b.jpg", "depth.tif", "preview.dng"}
+    assert "convert to JPEG" in reasons["preview.dng"]
     assert [each.name for each in target.iterdir()] == ["a.png"]
-    assert steps == [1, 2]
+    assert steps == [1, 2, 3, 4]
 
 
-def test_folders_without_usable_photos_are_refused(tmp_path: Path) -> None:
+def test_copies_follow_their_photos(folders: tuple[Path, Path]) -> None:
+    source, target = folders
+    for name in ("same.webp", "other.png"):
+        PIL.Image.fromarray(_texture()).save(source / name)
+    names = _copied(source, target)
+    assert names == ["other.png", "same.jpg"]
+    before = (target / "same.jpg").stat().st_ino
+    PIL.Image.fromarray(_texture(40)).save(source / "other.png")
+    assert _copied(source, target) == names
+    assert (target / "same.jpg").stat().st_ino == before  # a copy has a new one
+    assert np.array_equal(read_image(target / "other.png"), _texture(40))
+
+
+def test_photos_in_their_place_are_only_added_to(tmp_path: Path) -> None:
+    for name in ("deep.png", "a.webp"):
+        _written(tmp_path / name)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert _copied(tmp_path, tmp_path) == ["a.jpg", "deep.png"]
+    assert {name: (tmp_path / name).read_bytes() for name in before} == before
+    photos, left = photos_in(tmp_path)
+    assert copy_photos(photos, tmp_path, tmp_path, _silent)[0] == ["a.jpg", "deep.png"]
+    assert list(left.values()) == [["a.webp"]]
+    _written(tmp_path / "misnamed.jpg")
+    _, closed = copy_photos(photos_in(tmp_path)[0], tmp_path, tmp_path, _silent)
+    assert closed == {"cannot be read (it is of another format than its name says: rename it)": ["misnamed.jpg"]}
+
+
+def _touch(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(b"x")
+
+
+def _names_in(folder: Path) -> tuple[list[str], dict[str, list[str]]]:
+    photos, left = photos_in(folder)
+    return [path.relative_to(folder).as_posix() for path in photos], left
+
+
+def test_of_files_of_one_name_one_is_taken(tmp_path: Path) -> None:
+    _touch(
+        tmp_path, "1.HEIC", "1.jpg", "2.dng", "2.JPG", "3.CR2", "3.heic", "4.png", "4.jpeg", "img_5.heic", "IMG_5.JPG"
+    )
+    names, left = _names_in(tmp_path)
+    assert names == ["1.jpg", "2.JPG", "3.heic", "4.jpeg", "IMG_5.JPG"]
+    assert left == {"another file of that name is taken": ["4.png", "1.HEIC", "img_5.heic", "2.dng", "3.CR2"]}
+
+
+def test_photos_of_folders_keep_apart(tmp_path: Path) -> None:
+    _touch(tmp_path, "left/1.jpg", "right/1.jpg", "right/far/1.jpg", "masks/1.png", ".trash/1.jpg", "left/._1.jpg")
+    _touch(tmp_path, "made/prepare.json", "made/images/1.jpg", "images_4/1.jpg")
+    names, left = _names_in(tmp_path)
+    assert names == ["left/1.jpg", "right/1.jpg", "right/far/1.jpg"]
+    assert {name for files in left.values() for name in files} == {".trash/1.jpg", "images_4/1.jpg", "masks/1.png"}
+    _touch(tmp_path, "1.jpg")
+    names, left = _names_in(tmp_path)
+    assert names == ["1.jpg"]
+    assert sum(map(len, left.values())) == 6
+
+
+def test_copies_in_folders_keep_their_names(folders: tuple[Path, Path]) -> None:
+    source, target = folders
+    for name in ("left/1.png", "right/1.webp"):
+        (source / name).parent.mkdir()
+        PIL.Image.fromarray(_texture()).save(source / name)
+    assert _copied(source, target) == ["left/1.png", "right/1.jpg"]
+    assert (target / "right/1.jpg").is_file()
+
+
+def test_folders_without_photos_are_refused(tmp_path: Path) -> None:
+    _touch(tmp_path, "masks/a.png", "notes.txt")
     with pytest.raises(SceneError, match="no photos; it must hold files that end in"):
         photos_in(tmp_path)
-    (tmp_path / "a.HEIC").write_bytes(b"x")
-    with pytest.raises(SceneError, match=r"a\.HEIC and 0 more cannot be read: convert them to JPEG"):
-        photos_in(tmp_path)
+
+
+def test_many_names_are_cut_short() -> None:
+    assert some(["a", "b"]) == "a, b"
+    assert some([str(k) for k in range(10)]) == "0, 1, 2, 3, 4, 5, 6, 7 and 2 more"
+
+
+def test_panoramas_and_few_photos_have_their_own_words(tmp_path: Path) -> None:
+    sizes = {"a.png": (64, 32), "b.png": (32, 16), "c.png": (32, 24), "d.png": (32, 24)}
+    for name, size in sizes.items():
+        PIL.Image.new("RGB", size).save(tmp_path / name)
+    assert list(oddities(tmp_path, list(sizes))) == []  # a few may be cut so
+    (said,) = oddities(tmp_path, ["a.png", "b.png", "c.png", "a.png"])
+    assert "twice as wide as high: 360° panoramas must be cut" in said
+    (said,) = oddities(tmp_path, ["c.png", "d.png", "c.png"])
+    assert said.startswith("3 photos are hardly enough")
+
+
+def _photo(path: Path, seed: int = 0, focal: float | None = None, model: str = "phone") -> str:
+    """Write a photo with texture; returns its name."""
+    exif = PIL.Image.Exif()
+    if focal is not None:
+        exif[0x0110] = model
+        exif.get_ifd(0x8769)[0x920A] = focal
+    noise = np.random.default_rng(seed).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    PIL.Image.fromarray(noise).resize((128, 96)).save(path, exif=exif)
+    return path.name
+
+
+def test_photos_of_other_lenses_have_other_cameras(tmp_path: Path) -> None:
+    images, photos = tmp_path / "images", {}
+    for index, (name, focal, model) in enumerate(
+        [("1.jpg", 4.2, "phone"), ("2.png", 4.2, "phone"), ("3.jpg", 2.2, "phone"), ("4.jpg", 4.2, "another")]
+    ):
+        photos[name] = _photo(images / name, index, focal, model)
+    _photo(images / "more/1.jpg", 9, 4.2)
+    names = [*photos, "more/1.jpg"]
+    reconstruct._extract(tmp_path / "database.db", images, names, _silent, 400, 1)
+    found = dict(reconstruct._rows(tmp_path / "database.db", "select name, camera_id from images"))
+    assert found["1.jpg"] == found["2.png"]
+    assert len({found[name] for name in names}) == 4
+
+
+def test_features_are_found_once_unless_a_photo_changes(tmp_path: Path) -> None:
+    database, images = tmp_path / "database.db", tmp_path / "images"
+    names = [_photo(images / f"{seed}.png", seed) for seed in range(3)]
+
+    def extract(names: list[str]) -> dict[str, Any]:
+        stamps = reconstruct._extract(database, images, names, _silent, 400, 1)
+        assert list(stamps) == names
+        assert stamps_in(tmp_path).items() >= stamps.items()
+        rows = reconstruct._rows(database, "select name, data from images join keypoints using (image_id)")
+        return dict(rows)
+
+    first = extract(names[:2])
+    later = extract(names[1:])
+    assert later.keys() == set(names)  # a photo that is gone may come back
+    assert all(later[name] == first[name] for name in first)
+    _photo(images / names[1], 7)
+    changed = extract(names[1:])
+    assert changed.keys() == set(names[1:])
+    assert changed["1.png"] != first["1.png"]
+    assert changed["2.png"] == later["2.png"]
+
+
+def test_cameras_are_placed_again_for_other_photos_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pycolmap = import_pycolmap()
+    demo = pycolmap.Reconstruction(Path(reconstruct.__file__).parent / "demo/sparse/0")
+    found, asked = {0: demo}, []
+
+    def mapping(*_: object, options: Any, **__: object) -> dict[int, Any]:
+        asked.append(set(options.image_names))
+        return found
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
+
+    def placed(*names: str) -> int:
+        return len(reconstruct._map(tmp_path / "database.db", tmp_path, dict.fromkeys(names, "1"), _silent, 1))
+
+    assert (placed("a", "b"), placed("a", "b"), placed("a")) == (1, 1, 1)
+    assert asked == [{"a", "b"}, {"a"}]
+    found = {}
+    assert placed("a", "c") == 0
+    assert stamps_in(tmp_path / "sparse") == {"a": "1"}  # the scene of before stays
+    assert placed("a") == 1
+    assert asked == [{"a", "b"}, {"a"}, {"a", "c"}]
 
 
 def test_sharpness_does_not_depend_on_the_size() -> None:
