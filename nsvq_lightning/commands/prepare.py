@@ -12,7 +12,6 @@ Examples:
 import argparse
 import json
 import shlex
-import shutil
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -80,10 +79,10 @@ def run(options: argparse.Namespace) -> int:
         folder = source if in_place else images
         names, closed = reconstruct.copy_photos(photos, source, folder, report)
         left_out = [f"left out: {reconstruct.some(files)}: {reason}" for reason, files in (left | closed).items()]
-    _say(left_out)
     if len(names) < 2:
         few = f"{source}: {len(names)} pictures are too few, a scene takes 50 to 300"
         raise ValueError("; ".join([few, *left_out]))
+    _say(left_out)
     if find_model(source):
         _say([f"{source} has cameras already: nsvq fit --data.root {shlex.quote(str(source))} uses them"])
     _say(reconstruct.oddities(images, names))
@@ -111,12 +110,9 @@ def _frames(options: argparse.Namespace, images: Path, report: "Report") -> list
     """The names of the frames of a video, which are chosen unless that was done."""
     from nsvq_lightning.data import reconstruct
 
-    names = sorted(path.name for path in images.glob("frame_*.jpg"))
     # They were complete before features were looked for.
-    if names and (options.scene / reconstruct.DATABASE).exists():
-        return names
-    for name in names:
-        (images / name).unlink()
+    if (options.scene / reconstruct.DATABASE).exists():
+        return [name for name in reconstruct.stamps_in(options.scene) if (images / name).exists()]
     names = reconstruct.write_frames(options.source, images, options.frames, report)
     _say([f"{len(names)} sharp frames"])
     return names
@@ -139,8 +135,8 @@ def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
         raise ValueError(f"{scene} is not empty and was not made by this command: name a new folder")
     if options.again and path.is_file():
         reconstruct.remove_database(scene)
-        made = {"images", "sparse", "mapping", reconstruct.STAMPS, reconstruct.RECORD}
-        for target in (scene / name for name in made - own):
-            shutil.rmtree(target) if target.is_dir() else target.unlink(missing_ok=True)
+        # The model stays until there is another, and is of no photo as it is now.
+        if outdated := dict.fromkeys(reconstruct.stamps_in(scene / "sparse"), ""):
+            write_text(scene / "sparse" / reconstruct.STAMPS, json.dumps(outdated))
     (scene / "images").mkdir(parents=True, exist_ok=True)
     write_text(path, json.dumps(record, indent=2) + "\n")

@@ -173,8 +173,9 @@ def _extract(
         for name in group:
             stamps[name] = f"{model} {zlib.crc32((images / name).read_bytes()):08x}"
     known = stamps_in(images.parent)
-    if any(known.get(name, stamp) != stamp for name, stamp in stamps.items()):
+    if not database.exists() or any(known.get(name, stamp) != stamp for name, stamp in stamps.items()):
         remove_database(images.parent)
+        known = {}
     # With those of photos that have gone, whose features stay in the database; they may come back.
     write_text(images.parent / STAMPS, json.dumps(known | stamps))
     options = pycolmap.FeatureExtractionOptions(max_image_size=max_size, num_threads=threads, use_gpu=False)

@@ -131,8 +131,11 @@ def test_photos_are_added_and_leave_by_the_same_command(
     _noise(photos / "odd.png")
     assert "no place" in _fails(capsys, photos, scene)
     assert copies() == ["a.png", "b.png", "c.png", "mine.png", "odd.png"]  # what the scene of before needs, too
+    assert "no place" in _fails(capsys, photos, scene, "--again", "--max-size", "800")
+    assert (scene / "sparse").is_dir()
+    assert "c.png" in copies()
     (photos / "odd.png").rename(photos / "d.png")
-    assert main(["prepare", str(photos), str(scene)]) == 0
+    assert main(["prepare", str(photos), str(scene), "--max-size", "800"]) == 0
     assert found == [["a.png", "b.png", "c.png"], ["a.png", "b.png", "d.png"]]
     assert copies() == ["a.png", "b.png", "d.png", "mine.png"]
     said = capsys.readouterr().out

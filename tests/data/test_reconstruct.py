@@ -309,6 +309,15 @@ def test_features_are_found_once_unless_a_photo_changes(tmp_path: Path) -> None:
     assert changed["2.png"] == later["2.png"]
 
 
+def test_stamps_of_a_database_that_is_gone_are_forgotten(tmp_path: Path) -> None:
+    database, images = tmp_path / "database.db", tmp_path / "images"
+    names = [_photo(images / f"{seed}.png", seed) for seed in range(2)]
+    reconstruct._extract(database, images, names, _silent, 400, 1)
+    reconstruct.remove_database(tmp_path)
+    reconstruct._extract(database, images, names[1:], _silent, 400, 1)
+    assert stamps_in(tmp_path).keys() == {names[1]}
+
+
 def test_cameras_are_placed_again_for_other_photos_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pycolmap = import_pycolmap()
     demo = pycolmap.Reconstruction(Path(reconstruct.__file__).parent / "demo/sparse/0")
