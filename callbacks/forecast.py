@@ -32,6 +32,7 @@ def step_seconds(scene: Scene, count: int, device: torch.device | str = "cpu") -
         count: Number of splats.
         device: Where to train.
     """
+    scene = scene.standard
     splats = grown(scene, count).to(device)
     adam = optim.build_adam(optim.param_groups(splats, {}, optim.LearningRates(), scene.extent))
     views = [scene.view(index).to(device) for index in scene.some_train(VIEWS)]
@@ -51,7 +52,12 @@ def step_seconds(scene: Scene, count: int, device: torch.device | str = "cpu") -
 
 
 def grown(scene: Scene, count: int) -> Splats:
-    """The scene's points as splats, repeated with small shifts until there are ``count``, and shrunk to match."""
+    """The scene's points as splats, repeated with small shifts until there are ``count``, and shrunk to match.
+
+    Args:
+        scene: In its frame.
+        count: Number of splats.
+    """
     start = Splats.from_points(scene.points, scene.colors)
     copies, draw = -(-count // len(start)), generator(0, 0, "forecast")
     rows = torch.arange(len(start)).repeat(copies)[: max(count, len(start))]

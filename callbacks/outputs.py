@@ -12,7 +12,7 @@ from lightning.pytorch.callbacks import BasePredictionWriter
 
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import optional
-from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.compressed import CompressedScene, placed
 from nsvq_lightning.io.formats import FORMATS, save
 from nsvq_lightning.io.nsvq.file import as_stored
 from nsvq_lightning.io.nsvq.precision import Storage
@@ -163,6 +163,7 @@ class LiveScene(WritingCallback):
             if module.history:
                 state["psnr"] = f"{module.history[-1]['psnr']:.2f}"
             scene = CompressedScene.from_splats(splats, config={"antialiased": module.antialiased, "live": state})
+            scene = placed(scene, module.frame)
             with optional(folder / viewer.LIVE_SCENE):
                 save(scene, folder / viewer.LIVE_SCENE, Storage("paper"))
         self._answered, ended = asked, time.monotonic()

@@ -23,7 +23,6 @@ from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
 from nsvq_lightning.report import files, page
-from nsvq_lightning.splats.splats import detached
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 
@@ -208,7 +207,7 @@ class MetricReport(WritingCallback):
             trainer.strategy.barrier("scene.nsvq")
             self._scene = read_nsvq(path)
         # Detached tensors, not the module: a submodule would enter checkpoints.
-        module.evaluation_splats = detached(self._scene.decode().to(module.device))
+        module.evaluation_splats = module.frame.splats(self._scene.decode().to(module.device))
         self._lpips, self._lpips_reason = build_lpips() if self.lpips else (None, "switched off")
         if self._lpips is not None:
             self._lpips.to(module.device)

@@ -366,7 +366,8 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
     step, paper_step = (iteration_seconds(scene, each, device) for each in recipes)
     most = round(growth.overshoot * budget)
     text = f"about {steps * step / 60:.0f} min for fast.yaml ({steps:,} steps, up to {most:,} splats), "
-    text += f"{all_steps * paper_step / 3600:.1f} h for the paper's run ({all_steps:,}, {paper:,}), on a machine as busy as now"
+    text += f"{all_steps * paper_step / 3600:.1f} h for the paper's run ({all_steps:,}, {paper:,}), "
+    text += "on a machine as busy as now"
     yield judged("run time", text)
 
 

@@ -14,9 +14,13 @@ from nsvq_lightning.data.images import ImageStore, Picture
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
-from nsvq_lightning.rendering.poses import view_towards
+from nsvq_lightning.rendering.frame import EXTENT, Frame
+from nsvq_lightning.rendering.poses import poses, view_towards
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import SplatTensors
+
+# Near plane of a guessed camera, as a share of the distance to what it looks at.
+NEARNESS = 0.02
 
 
 def look_at(target: NDArray[np.float64], eye: NDArray[np.float64], width: int, height: int, angle: float) -> Camera:
@@ -32,14 +36,14 @@ def look_at(target: NDArray[np.float64], eye: NDArray[np.float64], width: int, h
     view = view_towards(target, eye, np.array([0.0, -1.0, 0.0]))
     focal = 0.5 * width / math.tan(angle / 2)
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
-    return Camera(intrinsics, view, width, height)
+    return Camera(intrinsics, view, width, height, NEARNESS * float(np.linalg.norm(target - eye)) or NEAR)
 
 
 def middle_of(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
     """The median ``[3]`` of positions ``[N, 3]``, N > 0, and the distance from it within which four fifths lie."""
     points = means.astype(np.float64)
     middle = np.median(points, axis=0)
-    return middle, max(float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.8)), 1e-3)
+    return middle, float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.8)) or 1.0
 
 
 @torch.no_grad()
@@ -108,8 +112,10 @@ def own_scene(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool
         antialiased: Whether the splats are to be rendered with anti-aliasing.
     """
     photos = ((255 * picture).round().to(torch.uint8) for picture in pictures(splats, cameras, antialiased))
-    centres = torch.stack([camera.position for camera in cameras]).double()
-    reach = float((centres - centres.mean(0)).norm(dim=1).max())
+    centres = poses(cameras)[0]
+    frame = (
+        Frame.around(centres) if np.ptp(centres, axis=0).any() else Frame(middle_of(splats.means.numpy())[1] / EXTENT)
+    )
     return Scene(
         root=Path("own pictures"),
         names=tuple(f"{number:03d}" for number in range(len(cameras))),
@@ -119,7 +125,8 @@ def own_scene(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool
         colors=torch.zeros_like(splats.means),
         train=tuple(range(len(cameras))),
         test=(0,),
-        extent=1.1 * reach or middle_of(splats.means.detach().cpu().numpy())[1],
+        extent=EXTENT * frame.unit,
+        frame=frame,
         split="none",
     )
 
@@ -153,7 +160,7 @@ def likely_cameras(
     detail = torch.sigmoid(splats.opacities.detach()).double() * torch.exp(-splats.scales.detach().double().mean(1))
     weights = (detail / detail.sum()).cpu().numpy()
     middle = weights @ means
-    reach = max(math.sqrt(weights @ ((means - middle) ** 2).sum(1)), 2 * NEAR)
+    reach = math.sqrt(weights @ ((means - middle) ** 2).sum(1)) or 1.0
     draws, candidates = np.random.default_rng(seed), 5 * count
     directions = draws.standard_normal((candidates, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

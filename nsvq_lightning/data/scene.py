@@ -3,6 +3,7 @@
 import logging
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -30,6 +31,7 @@ from nsvq_lightning.data.images import (
 from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder
 from nsvq_lightning.data.transforms import random_points, read_poses
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.frame import EXTENT, Frame
 
 log = logging.getLogger(__name__)
 
@@ -65,18 +67,19 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A posed photo set in COLMAP's world frame.
+    """A posed photo set in the world frame of its files, which for training has another (:attr:`frame`).
 
     Attributes:
         root: Scene folder.
         names: Names of the views, sorted.
-        cameras: Pinhole camera of each view, float32.
+        cameras: Pinhole camera of each view, float32; scene units are those of the files.
         images: Pictures of the views, decoded at first use.
-        points: Sparse points ``[P, 3]`` float32, scene units, except those at the centre of a camera.
+        points: Sparse points ``[P, 3]`` float64, scene units, except those at the centre of a camera or far away.
         colors: Their colours ``[P, 3]`` float32, RGB in [0, 1].
         train: Indices of the train views, ascending.
         test: Indices of the test views, ascending.
-        extent: 1.1 × the largest distance of a train camera centre from the mean of the train camera centres.
+        extent: Of the cameras, scene units (:meth:`nsvq_lightning.rendering.frame.Frame.around`); 0 in one place.
+        frame: Coordinates that it is trained in.
         split: Which views are the test views, in words.
         white: Whether the photos show objects in front of white, as those of NeRF-synthetic scenes do.
     """
@@ -90,6 +93,7 @@ class Scene:
     train: tuple[int, ...]
     test: tuple[int, ...]
     extent: float
+    frame: Frame = Frame()  # noqa: RUF009  frozen
     split: str = "every 8th by name"
     white: bool = False
 
@@ -99,6 +103,13 @@ class Scene:
     def some_train(self, most: int) -> tuple[int, ...]:
         """Indices of at most this many train views, evenly spaced."""
         return self.train[:: -(-len(self.train) // most)]
+
+    @cached_property
+    def standard(self) -> "Scene":
+        """The scene in its frame."""
+        points = torch.from_numpy(self.frame.points(self.points.double().numpy()))
+        cameras = tuple(map(self.frame.camera, self.cameras))
+        return replace(self, cameras=cameras, points=points, extent=self.extent / self.frame.unit, frame=Frame())
 
     def view(self, index: int) -> View:
         """View ``index`` of all views.
@@ -110,8 +121,10 @@ class Scene:
 
 
 Factor = Literal[1, 2, 4, 8]
-# Distance of the cameras from the origin, in extents, from which float32 positions are too coarse: as on a map.
-_FARTHEST = 1e4
+# Distance of the cameras from the origin, in extents, from which files have another: float32 would be too coarse.
+_FARTHEST = 100
+# What is so many times as far from the middle as four fifths of its kind has gone astray.
+_ASTRAY = {"cameras": 10, "points": 100}
 ONE_PLACE = "are taken from one place: without parallax there is no depth; move while taking photos"
 
 
@@ -191,31 +204,31 @@ def load_scene(
         mask_folders = [f"{masks}_{factor}", masks] if factor else [masks]
         mask_files = find_masks(poses.images, files, folder, root, mask_folders)
     sources = _image_sources(poses, files, mask_files, divisor, max_width if factor is None else None)
-    cameras = tuple(_camera(image, source) for image, source in zip(poses.images, sources, strict=True))
+    poses, frame = _framed(poses, root)
+    cameras = tuple(_camera(image, source, frame) for image, source in zip(poses.images, sources, strict=True))
     if not len(poses.points):
         points = random_points([cameras[index] for index in train])
         log.info("%s has no points: %d random ones in what the cameras see take their place", root, len(points))
         poses = replace(poses, points=points, colors=np.full((len(points), 3), 128, np.uint8))
-    centres = np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in poses.images])
-    middle = centres[list(train)].mean(0)
-    extent = float(1.1 * np.linalg.norm(centres[list(train)] - middle, axis=1).max())
-    distance = float(np.linalg.norm(middle))
-    if extent > 0 and distance > _FARTHEST * extent:
-        log.warning(
-            f"the cameras are {distance / extent:.0f} times the extent of the scene from the origin, where float32 "
-            "positions are coarse; move the origin near the cameras (colmap model_transformer)"
-        )
+    centres = _centres(poses)
+    extent = EXTENT * frame.unit if np.ptp(centres, axis=0).any() else 0.0
     usable = _away_from(centres, poses.points, _AT_CAMERA * extent)
+    usable &= ~_astray(poses.points, "points")
+    if lost_points := np.count_nonzero(~usable):
+        log.warning(
+            "left out %d of %d points: at the centre of a camera, or far from all others", lost_points, len(usable)
+        )
     return Scene(
         root=root,
         names=tuple(image.name for image in poses.images),
         cameras=cameras,
         images=ImageStore(sources, cache_bytes),
-        points=torch.from_numpy(poses.points[usable]).float(),
+        points=torch.from_numpy(poses.points[usable]),
         colors=torch.from_numpy(poses.colors[usable]).float() / 255,
         train=train,
         test=test,
         extent=extent,
+        frame=frame,
         split=split,
         white=poses.synthetic,
     )
@@ -304,11 +317,48 @@ def usable(scene: Scene) -> Scene:
     return replace(scene, train=train, test=test)
 
 
-def _camera(image: ColmapImage, source: ImageSource) -> Camera:
+def _centres(model: ColmapModel) -> NDArray[np.float64]:
+    """Centres of the cameras ``[V, 3]``."""
+    return np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in model.images])
+
+
+def _framed(model: ColmapModel, root: Path) -> tuple[ColmapModel, Frame]:
+    """The frame of a model's cameras, and the model with an origin near them; warns of cameras that went astray."""
+    centres = _centres(model)
+    frame = Frame.around(centres)
+    if (lost := np.flatnonzero(_astray(centres, "cameras"))).size:
+        names = ", ".join(model.images[index].name for index in lost[:3])
+        log.warning(
+            "%d photos are far from all others, first %s: check their poses, or leave them out", lost.size, names
+        )
+    distance = float(np.linalg.norm(frame.middle)) / (EXTENT * frame.unit)
+    if distance < _FARTHEST:
+        return model, frame
+    log.info(
+        "%s: positions are relative to %s, %.0f extents away from 0, which files tell", root, frame.middle, distance
+    )
+    views = np.stack([image.viewmat for image in model.images])
+    views[:, :3, 3] += views[:, :3, :3] @ frame.middle
+    images = tuple(replace(image, viewmat=view) for image, view in zip(model.images, views, strict=True))
+    return replace(model, images=images, points=model.points - frame.middle), Frame(frame.unit, origin=frame.middle)
+
+
+def _astray(places: NDArray[np.float64], kind: str) -> NDArray[np.bool_]:
+    """Which places ``[P, 3]`` are much farther from the middle than the others; none of those that are not finite."""
+    finite = places[np.isfinite(places).all(1)]
+    if not len(finite):
+        return np.zeros(len(places), bool)
+    middle = np.median(finite, axis=0)
+    usual = np.quantile(np.linalg.norm(finite - middle, axis=1), 0.8, method="lower")
+    with np.errstate(invalid="ignore"):
+        return np.asarray((np.linalg.norm(places - middle, axis=1) > _ASTRAY[kind] * usual) & (usual > 0), np.bool_)
+
+
+def _camera(image: ColmapImage, source: ImageSource, frame: Frame) -> Camera:
     pinhole = source.pinhole
     try:
-        K, viewmat = torch.from_numpy(pinhole.K).float(), torch.from_numpy(image.viewmat).float()
-        return Camera(K, viewmat, pinhole.width, pinhole.height)
+        K, viewmat = torch.from_numpy(pinhole.K), torch.from_numpy(image.viewmat)
+        return Camera(K, viewmat, pinhole.width, pinhole.height, frame.near).to(dtype=torch.float32)
     except ValueError as error:
         raise SceneError(f"camera {image.camera_id} of image {source.path}: {error}; run COLMAP again") from error
 
@@ -318,15 +368,13 @@ _AT_CAMERA = 1e-6
 
 
 def _away_from(centres: NDArray[np.float64], points: NDArray[np.float64], radius: float) -> NDArray[np.bool_]:
-    """Which points ``[P, 3]`` are more than ``radius`` from all ``centres [V, 3]``, or not finite; warns of the rest.
+    """Which points ``[P, 3]`` are more than ``radius`` from all ``centres [V, 3]``, or not finite.
 
     At a camera's centre a point has no direction; splats there are in no view, or cover that camera's whole view.
     """
     away = np.ones(len(points), bool)
     finite = np.isfinite(points).all(1)
     away[finite] = cKDTree(centres).query(points[finite])[0] > radius
-    if not away.all():
-        log.warning("left out %d of %d points: they are at the centre of a camera", len(away) - away.sum(), len(away))
     return away
 
 

@@ -12,6 +12,7 @@ from nsvq_lightning.splats import attributes as splat
 from nsvq_lightning.splats.conventions import shN_degree, turned
 
 if TYPE_CHECKING:
+    from nsvq_lightning.rendering.frame import Frame
     from nsvq_lightning.splats.splats import Splats, SplatTensors
 
 log = logging.getLogger(__name__)
@@ -197,6 +198,13 @@ class CompressedScene:
         flags = {name: flags.astype(np.float32)[self.codes[name]] for name, flags in bad.items()}
         return splat.finite_rows({"means": self.means, "opacities": self.opacities, **self.raw, **flags})
 
+    def relative_to(self, origin: tuple[float, float, float]) -> "CompressedScene":
+        """The same scene with another origin of its positions."""
+        if self.origin == origin:
+            return self
+        means = self.means.astype(np.float64) + self.origin - origin
+        return replace(self, means=means.astype(np.float32), origin=origin)
+
     def finite(self) -> "CompressedScene":
         """The splats without NaN or infinite values; a warning counts the others by attribute."""
         keep, culprits = self.finite_rows()
@@ -326,6 +334,20 @@ def moved(scene: CompressedScene, matrix: NDArray[np.float64]) -> CompressedScen
         origin=(x, y, z),
         stored_bytes=None,
     )
+
+
+def placed(scene: CompressedScene, frame: "Frame") -> CompressedScene:
+    """The scene in the coordinates of its files, from those of the frame that it was trained in."""
+    if frame.unit == 1 and not any(frame.middle):
+        return replace(scene, origin=frame.origin)
+
+    def rows(tables: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+        longer = np.log(frame.unit)
+        return {name: (rows + longer).astype(np.float32) if name == "scales" else rows for name, rows in tables.items()}
+
+    means = (frame.unit * scene.means.astype(np.float64) + frame.middle).astype(np.float32)
+    raw, codebooks = rows(scene.raw), rows(scene.codebooks)
+    return replace(scene, means=means, raw=raw, codebooks=codebooks, origin=frame.origin, stored_bytes=None)
 
 
 def with_degree(scene: CompressedScene, degree: int) -> CompressedScene:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from nsvq_lightning.rendering.constants import FRUSTUM_MARGIN
+from nsvq_lightning.rendering.constants import FRUSTUM_MARGIN, NEAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,16 +19,18 @@ class Camera:
         viewmat: World to camera, rigid, ``[4, 4]``, scene units.
         width: Image width in pixels.
         height: Image height in pixels.
+        near: Splats whose centre is nearer than this along the viewing axis are not seen, scene units.
 
     Raises:
-        ValueError: A matrix has another shape, the image is empty, the focal lengths are not positive and finite, or
-            there is skew.
+        ValueError: A matrix has another shape, the image is empty, the focal lengths or ``near`` are not positive and
+            finite, or there is skew.
     """
 
     K: Tensor
     viewmat: Tensor
     width: int
     height: int
+    near: float = NEAR
     intrinsics: tuple[float, float, float, float] = field(init=False, repr=False)
     """``(fx, fy, cx, cy)`` in pixels."""
     packed_view: tuple[float, ...] = field(init=False, repr=False)
@@ -46,6 +48,8 @@ class Camera:
         object.__setattr__(self, "packed_view", _packed(self.viewmat))
         if not (0 < fx < math.inf and 0 < fy < math.inf):
             raise ValueError(f"Camera.K needs positive, finite focal lengths, got fx={fx}, fy={fy}")
+        if not 0 < self.near < math.inf:
+            raise ValueError(f"Camera.near must be positive and finite, got {self.near}")
         if self.K[0, 1] != 0:
             raise ValueError(f"Camera.K must be without skew, got {float(self.K[0, 1])}: no back-end renders it")
 
@@ -82,7 +86,7 @@ def _packed(viewmat: Tensor) -> tuple[float, ...]:
     return (*(x for row in rotation for x in row), *translation, *position)
 
 
-def camera_of(viewmat: Tensor, lens: tuple[float, ...], width: int, height: int) -> Camera:
+def camera_of(viewmat: Tensor, lens: tuple[float, ...], width: int, height: int, near: float = NEAR) -> Camera:
     """A camera.
 
     Args:
@@ -90,6 +94,7 @@ def camera_of(viewmat: Tensor, lens: tuple[float, ...], width: int, height: int)
         lens: ``(fx, fy, cx, cy)`` in pixels.
         width: Pixels.
         height: Pixels.
+        near: Distance of the near plane, scene units.
     """
     fx, fy, cx, cy = (float(number) for number in lens)
-    return Camera(torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), viewmat, width, height)
+    return Camera(torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), viewmat, width, height, near)

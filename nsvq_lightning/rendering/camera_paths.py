@@ -20,7 +20,7 @@ def reframed(camera: Camera, width: int, height: int) -> Camera:
     fx, fy, cx, cy = camera.intrinsics
     factor = min(width / camera.width, height / camera.height)
     centre = width / 2 + factor * (cx - camera.width / 2), height / 2 + factor * (cy - camera.height / 2)
-    return camera_of(camera.viewmat, (factor * fx, factor * fy, *centre), width, height)
+    return camera_of(camera.viewmat, (factor * fx, factor * fy, *centre), width, height, camera.near)
 
 
 def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -62,7 +62,7 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     lenses = np.stack([np.interp(times, at, column) for column in intrinsics.T], axis=1)
     matrices = turn(times).as_matrix()
     return [
-        camera_of(view_from(matrix, position), tuple(lens), width, height)
+        camera_of(view_from(matrix, position), tuple(lens), width, height, cameras[0].near)
         for matrix, position, lens in zip(matrices, place(times), lenses, strict=True)
     ]
 
@@ -94,10 +94,11 @@ def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     swing = 0.5 + 0.5 * np.sin(2 * math.pi * share)
     angles = start + (2 * math.pi * share if arc >= math.radians(270) else arc * swing)
     lens = tuple(np.median([camera.intrinsics for camera in cameras], axis=0))
+    first = cameras[0]
     path = []
     for angle in angles:
         eye = middle + height * up + radius * (math.cos(angle) * across + math.sin(angle) * ahead)
-        path.append(camera_of(view_towards(middle, eye, up), lens, cameras[0].width, cameras[0].height))
+        path.append(camera_of(view_towards(middle, eye, up), lens, first.width, first.height, first.near))
     return path
 
 

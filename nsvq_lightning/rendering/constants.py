@@ -1,6 +1,7 @@
 """Constants of 3D Gaussian Splatting's rasterizer (Kerbl et al. 2023); every back-end shares them."""
 
-# Splats whose centre is nearer than this along the viewing axis are culled, scene units.
+# Splats whose centre is nearer than this along the viewing axis are culled, in units of a scene whose cameras have an
+# extent of 5 (:mod:`nsvq_lightning.rendering.frame`); of a camera that says nothing else.
 NEAR = 0.2
 
 # Added to both variances of the projected Gaussian, square pixels.

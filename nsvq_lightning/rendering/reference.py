@@ -104,7 +104,7 @@ def visible(splats: SplatTensors, camera: Camera) -> Tensor:
     size = means2d.new_tensor([camera.width - 1, camera.height - 1])
     high = torch.minimum((means2d + half_sizes - 0.5).floor(), size)
     reached = (half_sizes > 0).all(-1) & (low <= high).all(-1)
-    return ((depths > constants.NEAR) & reached & torch.isfinite(conics).all(-1)).nonzero()[:, 0]
+    return ((depths > camera.near) & reached & torch.isfinite(conics).all(-1)).nonzero()[:, 0]
 
 
 def light_kept(splats: SplatTensors, camera: Camera, rows: Tensor) -> Tensor:

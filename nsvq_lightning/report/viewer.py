@@ -113,7 +113,7 @@ def best_view(splats: SplatTensors, cameras: Sequence[Camera]) -> int:
         camera = camera.to("cpu", torch.float32)
         points = (means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T
         edges = (2 * points[:, :2] / points[:, 2:] / torch.tensor([camera.width, camera.height]) - 1).abs()  # at 1
-        return float((weights * (1 - edges).clamp(min=0).prod(1))[points[:, 2] > NEAR].sum())
+        return float((weights * (1 - edges).clamp(min=0).prod(1))[points[:, 2] > camera.near].sum())
 
     return max(range(len(cameras)), key=lambda place: shown(cameras[place]))
 
@@ -123,14 +123,14 @@ def camera_entry(camera: Camera) -> dict[str, Any]:
 
     Returns:
         ``camera_to_world``, 16 numbers row by row, of a camera that looks along -z with y up, as in OpenGL and
-        nerfstudio; ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` in pixels.
+        nerfstudio; ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` in pixels; ``near`` in scene units.
     """
     packed = camera.packed_view
     right, down, forward, position = packed[:3], packed[3:6], packed[6:9], packed[12:]
     rows = [[right[k], -down[k], -forward[k], position[k]] for k in range(3)]
     pose = [float(f"{value:.9g}") + 0.0 for row in [*rows, [0.0, 0.0, 0.0, 1.0]] for value in row]
     intrinsics = dict(zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True))
-    return {"camera_to_world": pose, "width": camera.width, "height": camera.height, **intrinsics}
+    return {"camera_to_world": pose, "width": camera.width, "height": camera.height, **intrinsics, "near": camera.near}
 
 
 def page_cameras(path: StrPath) -> dict[str, Camera]:
@@ -150,7 +150,8 @@ def page_cameras(path: StrPath) -> dict[str, Camera]:
             pose = torch.tensor(entry["camera_to_world"], dtype=torch.float64).view(4, 4)
             fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
             K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-            cameras[name] = Camera(K, (pose @ opengl).inverse().float(), width, height)
+            near = float(entry.get("near", NEAR))
+            cameras[name] = Camera(K, (pose @ opengl).inverse().float(), width, height, near)
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"the cameras in {path} are damaged ({error}): name the photos with --data.root") from error
     return cameras

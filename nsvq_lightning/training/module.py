@@ -19,8 +19,9 @@ from nsvq_lightning.quantize.attributes import build_quantizers, decoded, noisy_
 from nsvq_lightning.quantize.straight_through import TrainedStraightThrough
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.rendering.rasterize import Render, visible
-from nsvq_lightning.splats.splats import RawSplats, Splats
+from nsvq_lightning.splats.splats import RawSplats, Splats, detached
 from nsvq_lightning.training import distributed, optim, resume, scene_module
 from nsvq_lightning.training.scene_module import Stopwatch
 from nsvq_lightning.training.schedule import Phase, Schedule
@@ -57,7 +58,7 @@ class SplatModule(resume.ResumedModule):
         seed: Seed of every draw of the run except the order of the views.
         storage: Level of the compressed file, and how exactly it stores the scene.
         init_from: Scene file of any format to start from, without its non-finite splats.
-        splats: Splats to start from, for use from Python.
+        splats: Splats to start from, for use from Python. A fit takes them into the :attr:`frame` of its scene.
 
     Raises:
         ValueError: A codebook is for an unknown attribute or has no code, or an argument is out of range.
@@ -102,6 +103,7 @@ class SplatModule(resume.ResumedModule):
         self.phase = Phase.WARMUP
         self.active_sh_degree = 0 if splats is None else splats.sh_degree
         self.extent = 0.0
+        self.frame = Frame()
         self.stopwatch = Stopwatch()
         self.schedule = Schedule()
         self.loss_terms: dict[str, LossTerm] = {"photometric": self._photometric_term}
@@ -131,7 +133,7 @@ class SplatModule(resume.ResumedModule):
         """Render what the current phase trains or, outside training, what a file would hold.
 
         Args:
-            camera: Where to look from.
+            camera: Where to look from, in the coordinates of the files.
             pixel_weights: Strength of each pixel ``[H, W]``, see :func:`nsvq_lightning.render`.
         """
         options: dict[str, Any] = {"pixel_weights": pixel_weights}
@@ -140,7 +142,7 @@ class SplatModule(resume.ResumedModule):
         return self.render_splats(self._phase_splats(camera), camera, **options)
 
     def _phase_splats(self, camera: Camera) -> RawSplats:
-        raw = self.splats.raw()
+        raw, camera = self.splats.raw(), self.frame.camera(camera)
         if self.phase < Phase.QUANTIZE or not self.codebooks:
             return raw
         if self.phase is Phase.QUANTIZE and self.training:
@@ -171,13 +173,22 @@ class SplatModule(resume.ResumedModule):
                 "whatever it says, and a scaled loss would grow splats needlessly; leave it at 32-true"
             )
         self.evaluation_splats = None  # an interrupted evaluation may have left some
-        if (scene := scene_module.scene_of(self.trainer)) is not None:
+        scene = scene_module.scene_of(self.trainer)
+        if scene is not None:
             self.background = scene_module.background_of(scene, self.background)
         if stage == "fit":
+            if scene is not None and self.frame == Frame():
+                self._enter(scene.frame)
             distributed.check_strategy(self.trainer.strategy)
             check_threads()
             extent = partial(scene_module.extent_of, self.trainer)
             self.extent = self.extent or distributed.on_first_process(self.trainer, extent)
+
+    def _enter(self, frame: Frame) -> None:
+        """Take splats that came with the coordinates of the files into the frame that they will be trained in."""
+        self.frame = frame
+        for tensor, moved in zip(detached(self.splats), frame.splats(self.splats), strict=True):
+            tensor.copy_(moved)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """One Adam optimiser with a named group for each attribute and codebook; first splats, if there are none."""

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.splats.splats import sh_degree_of
 from nsvq_lightning.training.scene_module import SceneModule, Stopwatch, scene_of
 from nsvq_lightning.training.schedule import Phase, Schedule
@@ -192,9 +193,10 @@ def _is_harmless(text: str) -> bool:
 def scene_record(scene: Scene) -> dict[str, Any]:
     """What a checkpoint remembers of its scene: the folder's name, and a digest of the pose of each view by name.
 
-    Neither the size of the photos nor the place of the folder, masks or the choice of test views change it.
+    Neither the size of the photos nor the place of the folder, masks, the choice of test views or the unit change it.
     """
-    poses = {name: camera.viewmat.flatten().tolist() for name, camera in zip(scene.names, scene.cameras, strict=True)}
+    cameras = zip(scene.names, scene.standard.cameras, strict=True)
+    poses = {name: camera.viewmat.flatten().tolist() for name, camera in cameras}
     digests = {
         name: sha256(repr([round(value, 4) + 0.0 for value in pose]).encode()).hexdigest()[:8]
         for name, pose in poses.items()
@@ -290,14 +292,16 @@ class ResumedModule(SceneModule):
             super().__setattr__(name, value)
 
     def get_extra_state(self) -> Tensor:
-        """Phase, SH degree, extent and seconds of training ``[4]``, float64."""
+        """Phase, SH degree, extent, seconds of training, unit, middle and origin of the frame ``[11]``, float64."""
         self.stopwatch.lap()
         values = self.phase, self.active_sh_degree, self.extent, self.stopwatch.seconds
-        return torch.tensor(values, dtype=torch.float64)
+        frame = self.frame
+        return torch.tensor([*values, frame.unit, *frame.middle, *frame.origin], dtype=torch.float64)
 
     def set_extra_state(self, state: Tensor) -> None:
         """Go on from these."""
-        phase, degree, self.extent, self.stopwatch.seconds = state.tolist()
+        phase, degree, self.extent, self.stopwatch.seconds, unit, *places = state.tolist()
+        self.frame = Frame(unit, tuple(places[:3]), tuple(places[3:]))
         self.phase, self.active_sh_degree = Phase(int(phase)), int(degree)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -19,8 +19,8 @@ from nsvq_lightning.compute.environment import came_late
 from nsvq_lightning.compute.jit import compile_seconds
 from nsvq_lightning.data.dense_start import dense_points
 from nsvq_lightning.data.scene import ONE_PLACE, Scene, View
-from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.formats import load
+from nsvq_lightning.io.compressed import CompressedScene, placed
+from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import eight_bit, psnr
@@ -28,6 +28,7 @@ from nsvq_lightning.quantize.attributes import attribute_rows, decoded
 from nsvq_lightning.quantize.codebook import Quantizer
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.frame import EXTENT, Frame
 from nsvq_lightning.rendering.rasterize import Render, render
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, detached, sh_degree_of
 from nsvq_lightning.training.distributed import sum_over_processes
@@ -45,7 +46,7 @@ class SceneModule(LightningModule):
     """
 
     splats: Splats
-    """The splats; rows are edited only through :mod:`nsvq_lightning.training.row_ops`."""
+    """The splats, in :attr:`frame`; rows are edited only through :mod:`nsvq_lightning.training.row_ops`."""
     codebooks: nn.ModuleDict
     """Quantizer by attribute; empty for a run without quantization."""
     schedule: Schedule
@@ -55,7 +56,9 @@ class SceneModule(LightningModule):
     active_sh_degree: int
     """SH degree that is rendered; higher coefficients are ignored."""
     extent: float
-    """1.1 × the largest distance of a train camera from the mean of all, scene units; 0 while unknown."""
+    """Of the cameras, in units of the frame; 0 while unknown."""
+    frame: Frame
+    """Coordinates of the splats. Cameras that the module is given, and files that it makes, have those of the files."""
     rates: LearningRates
     storage: Storage
     init_from: str | None
@@ -67,7 +70,7 @@ class SceneModule(LightningModule):
     backend: str
     seed: int
     evaluation_splats: SplatTensors | None
-    """What validation, test and prediction render instead of the module's own splats."""
+    """What validation, test and prediction render instead of the module's own splats, in :attr:`frame`."""
 
     @property
     def quantizers(self) -> Mapping[str, Quantizer]:
@@ -80,7 +83,10 @@ class SceneModule(LightningModule):
 
     @torch.no_grad()
     def hard_splats(self, phase: Phase) -> RawSplats:
-        """The splats as a file written in ``phase`` would hold them, detached: hard codes from ``QUANTIZE`` on."""
+        """The splats as a file written in ``phase`` would hold them, detached: hard codes from ``QUANTIZE`` on.
+
+        They are still in :attr:`frame`.
+        """
         raw = detached(self.splats)
         return decoded(raw, self.quantizers) if phase >= Phase.QUANTIZE else raw
 
@@ -88,8 +94,8 @@ class SceneModule(LightningModule):
         """Render any splats at the active SH degree, over the module's background (``random``: black).
 
         Args:
-            splats: Raw attributes.
-            camera: Where to look from.
+            splats: Raw attributes, in :attr:`frame`.
+            camera: Where to look from, in the coordinates of the files.
             **options: Arguments of :func:`nsvq_lightning.render` that replace the module's.
         """
         white = torch.ones(3, device=self.device) if self.background == "white" else None
@@ -99,7 +105,7 @@ class SceneModule(LightningModule):
             "antialiased": self.antialiased,
             "backend": self.backend,
         }
-        return render(splats, camera, **(own | options))
+        return render(splats, self.frame.camera(camera), **(own | options))
 
     def compressed(self) -> CompressedScene:
         """The scene as it is stored: frozen or nearest codes, codebooks, positions, opacities and the settings.
@@ -125,10 +131,10 @@ class SceneModule(LightningModule):
             "background": self.background,
             **({"antialiased": True} if self.antialiased else {}),
             "dssim_weight": self.dssim_weight,
-            "extent": self.extent,
+            "extent": self.extent * self.frame.unit,
             "seed": self.seed,
         }
-        return replace(scene, config=settings)
+        return placed(replace(scene, config=settings), self.frame)
 
     def _start_evaluation(self) -> None:
         if len(self.splats) == 0:
@@ -272,15 +278,15 @@ def train_sensitivities(
 
 
 def extent_of(trainer: Trainer) -> float:
-    """Extent of the trainer's scene, scene units, above 0.
+    """Extent of the trainer's scene in its frame, above 0.
 
     Raises:
         ValueError: There is no scene, or all its cameras are in one place.
     """
     scene = needed_scene(trainer, "the extent of the scene is unknown", "set the module's extent")
     if scene.extent <= 0.0:
-        raise ValueError(f"the {len(scene.train)} train photos of {scene.root} {ONE_PLACE}")
-    return scene.extent
+        raise ValueError(f"the {len(scene)} photos of {scene.root} {ONE_PLACE}")
+    return EXTENT
 
 
 # First splats of a run with a budget (docs/recipe.md): opacity; largest size in pixels of the nearest photo, as a lone
@@ -289,7 +295,7 @@ FIRST_OPACITY, MOST_PIXELS = 0.3, 50.0
 
 
 def first_splats(module: SceneModule) -> Splats:
-    """What the module starts from: a scene file without its non-finite splats, or one splat for each point.
+    """What the module starts from, in its frame: a scene file without non-finite splats, or a splat for each point.
 
     Points are those of SfM and, where the module asks for more, those of :mod:`nsvq_lightning.data.dense_start`.
 
@@ -299,11 +305,11 @@ def first_splats(module: SceneModule) -> Splats:
     """
     sh_degree, path = module.splats.sh_degree, module.init_from
     if path is not None:
-        loaded = load(path)
+        loaded = read_scene(path).relative_to(module.frame.origin)
         if (degree := loaded.sh_degree) != sh_degree:
             raise ValueError(f"{path} has SH degree {degree}, the module has {sh_degree}; set sh_degree={degree}")
-        return finite_splats(loaded, path)
-    scene = needed_scene(module.trainer, "no splats to start from", "set init_from")
+        return finite_splats(Splats.from_tensors(*module.frame.splats(loaded.decode())), path)
+    scene = needed_scene(module.trainer, "no splats to start from", "set init_from").standard
     points, colors = scene.points, scene.colors
     if module.first_points is None:
         return Splats.from_points(points, colors, sh_degree)
@@ -316,7 +322,7 @@ def first_splats(module: SceneModule) -> Splats:
         points, colors = torch.cat([points, more]), torch.cat([colors, their_colors])
     splats = Splats.from_points(points, colors, sh_degree, FIRST_OPACITY)
     cameras = [scene.cameras[index] for index in scene.train]
-    distances, _ = cKDTree(torch.stack([camera.position for camera in cameras])).query(splats.means.detach())
+    distances, _ = cKDTree([camera.packed_view[12:] for camera in cameras]).query(splats.means.detach())
     pixel = torch.from_numpy(distances).float() / max(camera.intrinsics[0] for camera in cameras)
     splats.scales.data.clamp_(max=(MOST_PIXELS * pixel).log()[:, None])
     return splats

@@ -86,6 +86,7 @@ def workloads(scope: Scope) -> list[Workload]:
         splats = detached(found.decode())
         name += f" {file.name}" if scene is not None else ""
     elif scene is not None:
+        scene = scene.standard
         splats = detached(Splats.from_points(scene.points, scene.colors, sh_degree=3))
     if scene is not None:
         return [_seen_by(scene.cameras[scene.train[0]], splats, name)]

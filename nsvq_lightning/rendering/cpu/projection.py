@@ -12,7 +12,6 @@ from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import color_range
 from nsvq_lightning.splats import conventions
 
-NEAR = F(constants.NEAR)
 BLUR = F(constants.BLUR)
 BLUR_SQUARED = F(constants.BLUR**2)
 MIN_SQUARED_NORM = F(conventions.MIN_SQUARED_NORM)
@@ -103,7 +102,7 @@ def footprint(camera, means, quats, scales, logits):
     right = simd.vmin(right, simd.load_one(camera, rec.WIDTH) - 1)
     bottom = simd.vmin(bottom, simd.load_one(camera, rec.HEIGHT) - 1)
 
-    seen = (z > NEAR) & (reach > 0) & (left <= right) & (top <= bottom)
+    seen = (z > simd.load_one(camera, rec.NEAR)) & (reach > 0) & (left <= right) & (top <= bottom)
     seen = seen & (size < LARGEST_FOOTPRINT) & (determinant < FINITE)
     seen = seen & (simd.vfabs(px) < FINITE) & (simd.vfabs(py) < FINITE) & (logits >= -FINITE)
     # exp2_clamped makes a broken scale finite; the raw one still shows that it is broken.
@@ -153,7 +152,7 @@ def project_range(camera, means, quats, scales, logits, first, last, records, in
         count = min(16, last - start)
         mean = load_means(means, start, count, scratch)
         lanes = (1 << count) - 1
-        if simd.mask_bits(view_depth(camera, mean) > NEAR) & lanes == 0:
+        if simd.mask_bits(view_depth(camera, mean) > simd.load_one(camera, rec.NEAR)) & lanes == 0:
             continue
         quat, scale, logit = load_shapes(quats, scales, logits, start, count, scratch)
         seen, record, tiles, radius = footprint(camera, mean, quat, scale, logit)

@@ -38,8 +38,8 @@ TILE_SHIFT = 4
 TILE = 1 << TILE_SHIFT
 
 # Elements of the camera array of `pack_camera`.
-ROTATION, TRANSLATION, POSITION, FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, WIDTH, HEIGHT = (
-    0, 9, 12, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24,
+ROTATION, TRANSLATION, POSITION, FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, WIDTH, HEIGHT, NEAR = (
+    0, 9, 12, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25,
 )  # fmt: skip
 # Largest image side in pixels: a record has 16 bits, one of them the sign, for a tile's column or row.
 MAX_SIDE = TILE * (2**15 - 1)
@@ -58,7 +58,8 @@ def pack_camera(camera: Camera) -> Array:
         size = camera.width, camera.height
         if max(size) > MAX_SIDE:
             raise ValueError(f"an image side may have {MAX_SIDE} pixels, got {size[0]}x{size[1]}; render it in parts")
-        packed = np.array([*camera.packed_view, *camera.intrinsics, *camera.slope_limits, *size], np.float32)
+        lens = *camera.intrinsics, *camera.slope_limits, *size, camera.near
+        packed = np.array([*camera.packed_view, *lens], np.float32)
         _packed[camera] = packed
     return packed
 

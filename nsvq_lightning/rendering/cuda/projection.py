@@ -109,6 +109,8 @@ def load_geometry(means, quats, scales, row, mask):
 
 # Splats per program.
 BLOCK = 128
+# Place of the near plane among the numbers of a camera.
+NEAR = tl.constexpr(15)
 # Passed as the SH degree where no record is wanted.
 RADIUS_ONLY = -1
 
@@ -145,7 +147,7 @@ def project_kernel(
     left, right = tl.maximum(tl.ceil(px - half_x - 0.5), 0.0), tl.floor(px + half_x - 0.5)
     top, bottom = tl.maximum(tl.ceil(py - half_y - 0.5), 0.0), tl.floor(py + half_y - 0.5)
     right, bottom = tl.minimum(right, width - 1.0), tl.minimum(bottom, height - 1.0)
-    seen = inside & (z > rec.NEAR) & (reach > 0) & (left <= right) & (top <= bottom)
+    seen = inside & (z > tl.load(view + NEAR)) & (reach > 0) & (left <= right) & (top <= bottom)
     seen = seen & (size < rec.LARGEST_FOOTPRINT) & (determinant < rec.FINITE)
     seen = seen & (tl.abs(px) < rec.FINITE) & (tl.abs(py) < rec.FINITE) & (logit >= -rec.FINITE)
     # A log-scale of -inf is a splat without extent; one of +inf or NaN is broken.
@@ -296,7 +298,8 @@ class Lens(NamedTuple):
     """A camera as the kernels take it.
 
     Attributes:
-        view: Rotation row by row, translation and camera position ``[15]`` float32 on the device of the splats.
+        view: Rotation row by row, translation, camera position and near plane ``[16]`` float32 on the device of the
+            splats.
         fx: Focal length in x, pixels.
         fy: Focal length in y, pixels.
         cx: Principal point, x in pixels.
@@ -318,7 +321,7 @@ class Lens(NamedTuple):
         """Pack a camera; for one that has been packed for the device before, nothing is copied."""
         lens = _lenses.get(camera, {}).get(device)
         if lens is None:
-            view = to_device(torch.tensor(camera.packed_view, dtype=torch.float32), device)
+            view = to_device(torch.tensor([*camera.packed_view, camera.near], dtype=torch.float32), device)
             lens = cls(view, *camera.intrinsics, camera.width, camera.height)
             _lenses.setdefault(camera, {})[device] = lens
         return lens
@@ -348,7 +351,7 @@ class Projected(NamedTuple):
 
 def _check_attributes(lens: Lens, attributes: tuple[Tensor, ...]) -> None:
     n, device, coefficients = len(attributes[0]), attributes[0].device, attributes[-1].shape[1]
-    check_tensor("lens.view", lens.view, (15,), device)
+    check_tensor("lens.view", lens.view, (16,), device)
     shapes = (n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, coefficients, 3)
     for name, attribute, shape in zip(ATTRIBUTES, attributes, shapes, strict=True):
         check_tensor(name, attribute, shape, device)

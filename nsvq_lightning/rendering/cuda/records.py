@@ -49,7 +49,6 @@ FACTOR_SCALE = tl.constexpr(math.sqrt(0.5 * math.log2(math.e)))
 # Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)².
 COVARIANCE_SCALE = tl.constexpr(2 * math.log(2.0) ** 2)
 # The rest of what kernels take from the constants that all back-ends share.
-NEAR = tl.constexpr(constants.NEAR)
 BLUR = tl.constexpr(constants.BLUR)
 BLUR_SQUARED = tl.constexpr(constants.BLUR**2)
 FRUSTUM_MARGIN = tl.constexpr(constants.FRUSTUM_MARGIN)

@@ -1,0 +1,97 @@
+"""Coordinates in which a scene is trained: every length in them means the same, whatever unit its files have.
+
+The unit of COLMAP is arbitrary, and so is that of a phone or a map. Here the middle of the cameras is 0, and their
+extent is 5, as it is in most scenes of COLMAP: learning rates, first sizes and the near plane are told in this unit.
+"""
+
+import math
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.constants import NEAR
+from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
+
+Floats = NDArray[np.float64]
+
+# Extent of the cameras in a frame.
+EXTENT = 5.0
+# Places are rounded to so many steps a unit, a thousandth of a pixel: the same scene has the same bits in any unit.
+STEPS = 2.0**18
+# Cameras count up to so many times as far from their middle as four fifths of them: one lost camera is no extent.
+REACH = 2.0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Coordinates of a scene; x is at ``middle + unit · x`` in its files.
+
+    Attributes:
+        unit: Length of 1, in the unit of the files.
+        middle: Where 0 is, in the coordinates of the files.
+        origin: World coordinates of the 0 of the files; other than 0 only where that is far away, as on a map.
+    """
+
+    unit: float = 1.0
+    middle: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def around(cls, centres: Floats) -> "Frame":
+        """The frame of cameras: 0 is the median of their centres ``[V, 3]``, and their extent is :data:`EXTENT`.
+
+        The extent is 1.1 × the largest distance from the middle, though at most :data:`REACH` times the distance of
+        four fifths of the cameras. Of cameras in one place, the unit is that of the files.
+        """
+        middle = np.median(centres, axis=0)
+        extent = 1.1 * reach_of(np.linalg.norm(centres - middle, axis=1))
+        x, y, z = middle.tolist()
+        return cls(extent / EXTENT or 1.0, (x, y, z))
+
+    @property
+    def near(self) -> float:
+        """Distance of the near plane in the files."""
+        return NEAR * self.unit
+
+    def points(self, points: Floats) -> Floats:
+        """Points ``[P, 3]`` of the files, here; rounded."""
+        return np.asarray(np.rint((points - self.middle) / self.unit * STEPS) / STEPS)
+
+    def camera(self, camera: Camera) -> Camera:
+        """A camera of the files, here."""
+        if self == Frame():
+            return camera
+        known = _cameras.setdefault(camera, {})
+        if self not in known:
+            packed = np.array(camera.packed_view)
+            view = np.eye(4)
+            view[:3, :3] = packed[:9].reshape(3, 3)
+            view[:3, 3] = -view[:3, :3] @ self.points(packed[None, 12:])[0]
+            near = float(f"{camera.near / self.unit:.6g}")
+            moved = Camera(camera.K.double(), torch.from_numpy(view), camera.width, camera.height, near)
+            known[self] = moved.to(dtype=torch.float32)
+        return known[self]
+
+    def splats(self, splats: SplatTensors) -> RawSplats:
+        """Splats of the files, here; detached."""
+        raw = detached(splats)
+        if self == Frame():
+            return raw
+        middle = torch.tensor(self.middle, dtype=torch.float64, device=raw.means.device)
+        means = ((raw.means.double() - middle) / self.unit).to(raw.means)
+        return raw._replace(means=means, scales=(raw.scales.double() - math.log(self.unit)).to(raw.scales))
+
+
+# Cameras of the files, and what they are in frames.
+_cameras: WeakKeyDictionary[Camera, dict[Frame, Camera]] = WeakKeyDictionary()
+
+
+def reach_of(distances: Floats) -> float:
+    """The largest of distances ``[V]``, but at most :data:`REACH` times what four fifths of them do not exceed."""
+    usual = float(np.quantile(distances, 0.8, method="lower"))
+    largest = float(distances.max())
+    return min(largest, REACH * usual) if usual > 0 else largest
