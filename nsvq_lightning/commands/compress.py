@@ -96,9 +96,7 @@ def run(options: argparse.Namespace) -> int:
     if wrong:
         raise argparse.ArgumentError(None, wrong)
 
-    scene = read_scene(options.input).finite()
-    if len(scene) == 0:
-        raise ValueError(f"{options.input} holds no finite splat; there is nothing to compress")
+    scene = read_scene(options.input)
     most, books = splats_left(options.splats, len(scene)), options.codebooks or DEFAULT_SIZE
     # What is impossible is said before the scene is looked at.
     if options.target_bytes is not None:

@@ -105,12 +105,11 @@ def run(options: argparse.Namespace) -> int:
     entry = formats.format_of(output)
     if not output.parent.is_dir() and formats.suffix_of(output) != lod.NAME:
         raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
-    scene = _edited(compressed.joined([formats.read_scene(path).finite() for path in options.inputs]), options)
+    scene = _edited(compressed.joined([formats.read_scene(path) for path in options.inputs]), options)
     size = formats.save(scene, output, **writer)
     # What reading the output back would say of it is known here.
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
-    each = f", {size / len(scene):.1f} per splat" if len(scene) else ""
-    sys.stdout.write(f"{output}: {len(scene):,} splats in {size:,} bytes{each}\n")
+    sys.stdout.write(f"{output}: {len(scene):,} splats in {size:,} bytes, {size / len(scene):.1f} per splat\n")
     if entry.in_order is not None:  # the format is not exact
         errors = attribute_errors(formats.read_scene(output), entry.in_order(scene))
         listed = ", ".join(f"{name} {error:.2g}{'°' * (name == 'rotation')}" for name, error in errors.items())
@@ -204,9 +203,7 @@ def _measure(source: Path, output: Path, root: Path | None) -> None:
     """Say how pictures of two files differ."""
     from nsvq_lightning.compression.viewpoints import MEASURED, Measure, decibels
 
-    original = formats.read_scene(source).finite()
-    if len(original) == 0:
-        raise ValueError(f"{source} holds no finite splat; there is nothing to measure")
+    original = formats.read_scene(source)
     splats = original.decode()
     cameras, _ = views_of(source, splats, MEASURED, root)
     measure = Measure(splats, cameras, original.antialiased)

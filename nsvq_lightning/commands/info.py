@@ -1,4 +1,4 @@
-"""Describe a scene file of any format."""
+"""Describe a scene file of any format; of .nsvq, also its attributes and streams."""
 
 import argparse
 import json
@@ -31,7 +31,7 @@ def _text(facts: dict[str, Any]) -> str:
         ("format", facts["format"]),
         ("splats", f"{facts['splats']:,}"),
         ("SH degree", str(facts["sh_degree"])),
-        ("bytes", f"{size:,} ({size / 1e6:.2f} MB, {size / 2**20:.2f} MiB)"),
+        ("bytes", f"{size:,} ({size / 1e6:.2f} MB, {size / 2**20:.2f} MiB), {8 * size / splats:.2f} bits per splat"),
         ("plain .ply", f"{facts['plain_bytes']:,} bytes, {facts['ratio']:.2f} times this file"),
     ]
     if any(facts.get("origin", ())):
@@ -40,9 +40,10 @@ def _text(facts: dict[str, Any]) -> str:
     if "attributes" in facts:
         entries = ((a["name"], a["storage"], a["dim"], a["codes"], a["bits"]) for a in facts["attributes"])
         parts.append(_table(("attribute", "storage", "D", "K", "bits"), entries))
-    streams = ((s["name"], s["encoding"], s["bytes"]) for s in facts["streams"])
-    shares = ((*row, f"{8 * row[2] / splats:.2f}", f"{100 * row[2] / max(1, size):.1f} %") for row in streams)
-    parts.append(_table(("stream", "encoding", "bytes", "bits per splat", "share"), shares))
+    if "streams" in facts:
+        streams = ((s["name"], s["encoding"], s["bytes"]) for s in facts["streams"])
+        shares = ((*row, f"{8 * row[2] / splats:.2f}", f"{100 * row[2] / size:.1f} %") for row in streams)
+        parts.append(_table(("stream", "encoding", "bytes", "bits per splat", "share"), shares))
     for key in ("metrics", "config"):
         if facts.get(key):
             # Without the outer braces; the lines between them are already indented by two.

@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
     """Render a path.
 
     Raises:
-        ValueError: The scene is empty, the output is neither a video nor a folder, or there are no cameras to follow.
+        ValueError: The output is neither a video nor a folder, there are no cameras to follow, or no finite splats.
         OSError: A file cannot be read or written.
     """
     import torch
@@ -88,8 +88,6 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(f"{output}: name a video ({VIDEO}), or a folder for PNGs")
     scene = read_scene(file)
     splats = scene.decode()
-    if len(splats) == 0:
-        raise ValueError(f"{file} holds no splat; there is nothing to render")
     cameras, fps = _path(options, splats, is_video)
     device = best_device()
     raw, background = splats.to(device).raw(), torch.tensor(options.background, device=device)

@@ -113,8 +113,6 @@ def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     if options.live:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
     splats = load(file)
-    if len(splats) == 0:
-        raise ValueError(f"{options.scene} holds no splat; there is nothing to see")
     sys.stderr.write("no photos: cameras are guessed from the scene; --data.root names the folder of the photos\n")
     return {f"guess {index}": camera for index, camera in enumerate(likely_cameras(splats, 12), 1)}
 

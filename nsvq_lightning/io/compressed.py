@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.splats import attributes as splat
 from nsvq_lightning.splats.conventions import shN_degree, turned
 
@@ -206,8 +207,15 @@ class CompressedScene:
         return replace(self, means=means.astype(np.float32), origin=origin)
 
     def finite(self) -> "CompressedScene":
-        """The splats without NaN or infinite values; a warning counts the others by attribute."""
+        """The splats without NaN or infinite values; a warning counts the others by attribute.
+
+        Raises:
+            FormatError: There are none.
+        """
         keep, culprits = self.finite_rows()
+        if not keep.any():
+            reasons = f" ({splat.listed(culprits)} are not)" if culprits else ""
+            raise FormatError(f"no finite splat among {len(self)}{reasons}", "give a scene with splats")
         if not culprits:
             return self
         log.warning(splat.dropped(keep, culprits))

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.io.formats import FORMATS, read_scene, suffix_of
+from nsvq_lightning.io.formats import format_of, read_scene, suffix_of
+from nsvq_lightning.io.nsvq.header import describe_nsvq
 from nsvq_lightning.io.numbers import opacity_of
 from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.splats.conventions import unit
@@ -42,36 +42,19 @@ def attribute_errors(read: CompressedScene, written: CompressedScene) -> dict[st
 
 
 def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Facts about a file, as JSON values; its first bytes name the format, where it has such.
+    """Facts about a file, as JSON values.
 
     Raises:
-        FormatError: The file is damaged, or not in a format of :data:`~nsvq_lightning.io.formats.FORMATS`.
+        ValueError: Unknown suffix.
+        FormatError: The file is damaged, not in the format of its suffix, or holds no finite splat.
         OSError: It cannot be read.
     """
     path = Path(path)
-    with open(path, "rb") as file:
-        start = file.read(8)
-    entry = FORMATS.get(suffix_of(path))
-    if entry is None or entry.magics:
-        entry = next((known for known in FORMATS.values() if start.startswith(known.magics)), None)
-    if entry is None:
-        raise FormatError(f"{path}: not a {', '.join(FORMATS)} file", "give the file of a scene")
-    if entry.describe is not None:
-        facts = entry.describe(path)
+    if format_of(path).native:
+        facts = describe_nsvq(path)
     else:
-        scene, kind = read_scene(path), suffix_of(path).removeprefix(".")
-        streams = {"file": (kind, path.stat().st_size)}
-        facts = {"format": kind, "splats": len(scene), "sh_degree": scene.sh_degree, "streams": streams}
-    parts = [{"name": name, "encoding": kind, "bytes": size} for name, (kind, size) in facts["streams"].items()]
-    total = facts.get("bytes", path.stat().st_size)
+        scene = read_scene(path)
+        facts = {"format": suffix_of(path).removeprefix("."), "splats": len(scene), "sh_degree": scene.sh_degree}
+        facts["bytes"] = scene.stored_bytes
     plain_bytes = plain_ply_bytes(facts["splats"], facts["sh_degree"])
-    # An empty .splat has no bytes.
-    ratio = plain_bytes / max(1, total)
-    return {
-        "file": str(path),
-        **facts,
-        "streams": parts,
-        "bytes": total,
-        "plain_bytes": plain_bytes,
-        "ratio": ratio,
-    }
+    return {"file": str(path), **facts, "plain_bytes": plain_bytes, "ratio": plain_bytes / facts["bytes"]}

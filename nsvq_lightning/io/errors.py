@@ -15,10 +15,13 @@ class FormatError(ValueError):
 
     Args:
         defect: What is wrong, and where.
-        remedy: What to do about it.
+        remedy: What to do about it; by default, copy a file again that is damaged or truncated, and no other.
     """
 
-    def __init__(self, defect: str, remedy: str = "copy the file again or export it anew") -> None:
+    def __init__(self, defect: str, remedy: str = "") -> None:
+        if not remedy:
+            harmed = defect.startswith(("damaged", "truncated"))
+            remedy = "copy the file again or export it anew" if harmed else "export it anew, see docs/formats.md"
         super().__init__(defect, remedy)
         self.defect, self.remedy = defect, remedy
 
@@ -33,6 +36,12 @@ def naming_file(path: str | PathLike[str]) -> Iterator[None]:
         yield
     except FormatError as error:
         raise FormatError(f"{fspath(path)}: {error.defect}", error.remedy) from None
+
+
+def wrong_start(suffix: str, data: bytes, magic: bytes) -> FormatError:
+    """The error of a file that does not start as its format does, or ends before it does."""
+    cut = "truncated, or " if magic.startswith(data[: len(magic)]) else ""
+    return FormatError(f"{cut}not a {suffix} file: it does not start with {magic.decode('latin-1')!r}")
 
 
 # Splats that any file may hold, however short, such as one of equal splats; beyond, each takes two bytes or more. A

@@ -1,4 +1,4 @@
-"""Load, save and describe scenes of any format: the end of the file's name selects it."""
+"""Load and save scenes of any format: the end of the file's name selects it."""
 
 import logging
 import os
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from nsvq_lightning.io import glb, lod, ply, sog, splat, spz, usda
 from nsvq_lightning.io.compressed import CompressedScene, in_morton_order
+from nsvq_lightning.io.errors import naming_file
 from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_nsvq
-from nsvq_lightning.io.nsvq.header import MAGIC, describe_nsvq
 from nsvq_lightning.io.nsvq.precision import Storage
 
 if TYPE_CHECKING:
@@ -27,9 +27,6 @@ class Format:
         description: A few words for error messages and help.
         read: Scene from a file; codebooks are kept where the format has them.
         write: ``write(path, scene, **options) -> bytes written``; None if it is only read.
-        describe: Facts about a file: ``format``, ``splats``, ``sh_degree``, ``streams`` (encoding and bytes of each
-            part by name), and what else there is to say. None reads the scene for them.
-        magics: First bytes of its files; none if only the name tells.
         native: Whether it is our own: it holds the origin that positions are relative to, and ``write`` has an option
             ``storage``, the level and precision.
         in_order: Gives the splats of a scene that a file holds, in file order, for comparison with what is read back;
@@ -39,21 +36,19 @@ class Format:
     description: str
     read: Callable[[Path], CompressedScene]
     write: Callable[..., int] | None
-    describe: Callable[[Path], dict[str, Any]] | None = None
-    magics: tuple[bytes, ...] = ()
     native: bool = False
     in_order: Callable[[CompressedScene], CompressedScene] | None = None
 
 
 def load(path: str | os.PathLike[str]) -> "Splats":
-    """Load a scene of any supported format.
+    """Load a scene of any supported format; splats with NaN or infinite values are left out with a warning.
 
     Args:
         path: File; its suffix, upper or lower case, selects the format, see :data:`FORMATS`.
 
     Raises:
         ValueError: Unknown suffix.
-        FormatError: The file is damaged or not in the format of its suffix.
+        FormatError: The file is damaged, not in the format of its suffix, or holds no finite splat.
         FileNotFoundError: No such file.
     """
     scene = read_scene(path)
@@ -68,7 +63,11 @@ def read_scene(path: str | os.PathLike[str]) -> CompressedScene:
     """Read a scene of any supported format, keeping its codebooks; arguments and errors are those of :func:`load`."""
     path = Path(path)
     scene = format_of(path).read(path)
-    return replace(scene, stored_bytes=scene.stored_bytes or path.stat().st_size)
+    with naming_file(path):
+        kept = scene.finite()
+    if unturned := int(kept.spread("quats", lambda rows, _: ~rows.any(1)).sum()):
+        logger.warning("%s: %d of %d splats have the rotation 0 0 0 0: not turned", path, unturned, len(kept))
+    return replace(kept, stored_bytes=scene.stored_bytes or path.stat().st_size)
 
 
 def save(
@@ -94,6 +93,7 @@ def save(
 
     Raises:
         ValueError: Unknown suffix, or one that is only read.
+        FormatError: The scene has no finite splat.
         TypeError: The format has no such option.
     """
     path = Path(path)
@@ -102,7 +102,8 @@ def save(
         raise ValueError(f"cannot write {path}: {suffix_of(path)} is only read")
     if not isinstance(scene, CompressedScene):
         scene = CompressedScene.from_splats(scene)
-    scene = scene.finite()
+    with naming_file(path):
+        scene = scene.finite()
     if any(scene.origin) and not entry.native:
         logger.warning("%s: the origin %s of the positions is not stored; add it in the viewer", path, scene.origin)
     if entry.native:
@@ -127,52 +128,44 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     if suffix := suffix_of(path):
         return FORMATS[suffix]
     supported = ", ".join(f"{suffix} ({entry.description})" for suffix, entry in FORMATS.items())
-    raise ValueError(f"{path}: unknown suffix {Path(path).suffix!r}; supported are {supported}")
+    way = _WAYS.get(suffix := Path(path).suffix.lower())
+    advice = f"; {way}" if way else ""
+    raise ValueError(f"{path}: unknown suffix {suffix!r}; supported are {supported}{advice}")
 
 
+# What turns files of other formats into some that are read.
+_WAYS = {
+    ".usd": usda.BINARY_REMEDY,
+    ".usdc": usda.BINARY_REMEDY,
+    ".usdz": usda.BINARY_REMEDY,
+    ".ksplat": "splat-transform (npm) converts it",
+    ".gltf": "save it as .glb",
+}
 # Formats by the end of the file's name; a new format is one more entry.
 FORMATS: dict[str, Format] = {
-    ".ply": Format("3D Gaussian Splatting", ply.read_ply, ply.write_ply, ply.describe_ply, (b"ply",)),
-    ".nsvq": Format("compressed scene of this package", read_nsvq, write_nsvq, describe_nsvq, (MAGIC,), native=True),
-    ".sog": Format(
-        "PlayCanvas, SuperSplat",
-        sog.read_sog,
-        sog.write_sog,
-        sog.describe_sog,
-        magics=(b"PK\x03\x04",),
-        in_order=in_morton_order,
-    ),
-    ".spz": Format(
-        "Niantic",
-        spz.read_spz,
-        spz.write_spz,
-        spz.describe_spz,
-        magics=(b"\x1f\x8b", b"NGSP"),
-        in_order=spz.in_spz_order,
-    ),
+    ".ply": Format("3D Gaussian Splatting", ply.read_ply, ply.write_ply),
+    ".nsvq": Format("compressed scene of this package", read_nsvq, write_nsvq, native=True),
+    ".sog": Format("PlayCanvas, SuperSplat", sog.read_sog, sog.write_sog, in_order=in_morton_order),
+    ".spz": Format("Niantic", spz.read_spz, spz.write_spz, in_order=spz.in_spz_order),
     ".glb": Format("glTF, KHR_gaussian_splatting", glb.read_glb, glb.write_glb),
     ".usda": Format("OpenUSD, for scenes of moderate size", usda.read_usda, usda.write_usda),
     ".compressed.ply": Format(
         "PlayCanvas, SuperSplat",
         ply.read_ply,
         ply.write_compressed_ply,
-        ply.describe_ply,
-        magics=(b"ply",),
         in_order=in_morton_order,
     ),
     lod.NAME: Format(
         "streamed SOG, a folder with levels of detail",
         lod.read_lod,
         lod.write_lod,
-        lod.describe_lod,
         in_order=lod.in_lod_order,
     ),
-    sog.META: Format("SOG as a folder", sog.read_sog, None, sog.describe_sog),
+    sog.META: Format("SOG as a folder", sog.read_sog, None),
     ".splat": Format(
         "first viewers on the web, without spherical harmonics",
         splat.read_splat,
         splat.write_splat,
-        splat.describe_splat,
         in_order=lambda scene: scene,
     ),
 }

@@ -36,6 +36,15 @@ def logits_of_bytes(levels: NDArray[np.uint8]) -> NDArray[np.float32]:
     return logits_of(np.arange(256) / 255)[levels]
 
 
+# Logarithm of an axis length of 0, which discs have: that of the smallest number of float32 with full precision.
+FLAT = float(np.log(np.finfo(np.float32).tiny))
+
+
+def logs_of_lengths(lengths: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Logarithms of axis lengths of any shape, :data:`FLAT` or more; NaN and infinite lengths stay."""
+    return np.log(lengths.clip(np.finfo(np.float32).tiny))
+
+
 logger = logging.getLogger(__name__)
 
 # What float32 rounding may add to a distance of one half.

@@ -13,7 +13,6 @@ offset     bytes  content
 import logging
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from nsvq_lightning.io.atomic import write_bytes
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, opacity_of
+from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, logs_of_lengths, opacity_of
 from nsvq_lightning.splats.conventions import SH_C0, unit
 
 logger = logging.getLogger(__name__)
@@ -74,31 +73,16 @@ def read_splat(path: str | os.PathLike[str]) -> CompressedScene:
     Raises:
         FormatError: The file does not consist of whole splats.
     """
-    describe_splat(path)
-    records = np.frombuffer(Path(path).read_bytes(), _RECORD)
+    data = Path(path).read_bytes()
+    with naming_file(path):
+        if len(data) % (each := _RECORD.itemsize):
+            raise FormatError(f"truncated, or not a .splat file: {len(data)} bytes are not whole splats of {each}")
+    records = np.frombuffer(data, _RECORD)
     colors = records["colors"]
     raw = {
         "quats": ((records["quats"].astype(np.float32) - 128) / 128).astype(np.float32),
-        "scales": np.log(np.maximum(records["lengths"], np.finfo(np.float32).tiny)).astype(np.float32),
+        "scales": logs_of_lengths(records["lengths"]),
         "sh0": ((colors[:, :3] / 255 - 0.5) / SH_C0).astype(np.float32),
         "shN": np.zeros((len(records), 0), np.float32),
     }
     return CompressedScene(records["means"].astype(np.float32), logits_of_bytes(colors[:, 3]), raw=raw, sh_degree=0)
-
-
-def describe_splat(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Facts about a file, which has no header, see :class:`nsvq_lightning.io.formats.Format`.
-
-    Raises:
-        FormatError: The file does not consist of whole splats.
-    """
-    size = os.path.getsize(path)
-    with naming_file(path):
-        if size % _RECORD.itemsize:
-            raise FormatError(
-                f"truncated, or not a .splat file: of {size} bytes the last {size % _RECORD.itemsize} are not "
-                f"a whole splat of {_RECORD.itemsize}"
-            )
-    count = size // _RECORD.itemsize
-    streams = {name: ("splat", count * _RECORD[name].itemsize) for name in _RECORD.names or ()}
-    return {"format": "splat", "splats": count, "sh_degree": 0, "streams": streams}

@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, in_morton_order, rotated
-from nsvq_lightning.io.errors import FormatError, check_room, naming_file
+from nsvq_lightning.io.errors import FormatError, check_room, naming_file, wrong_start
 from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, opacity_of
 from nsvq_lightning.splats import conventions
 
@@ -85,7 +85,7 @@ class SpzHeader:
         return {name: self.count * size for name, size in self.sizes.items() if self.count * size}
 
 
-_MAGIC = b"NGSP"
+_MAGIC, _GZIP = b"NGSP", b"\x1f\x8b"
 # Magic, version, N, SH degree, fractional bits, flags, and number of streams (0 up to version 3).
 _HEADER = struct.Struct("<4sIIBBBB")
 _TABLE_OFFSET = struct.Struct("<I12x")
@@ -126,34 +126,6 @@ def _write_frame(path: str | os.PathLike[str], header: SpzHeader, arrays: Mappin
             with gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as stream:
                 stream.writelines([start, *contents, axes])
         return file.tell()
-
-
-def read_spz_header(path: str | os.PathLike[str]) -> tuple[SpzHeader, dict[str, int]]:
-    """Header, and the size in bytes of each part of the file; needs no Zstandard.
-
-    Raises:
-        FormatError: The file is truncated, of another version, or not a ``.spz`` file.
-    """
-    data = Path(path).read_bytes()
-    with naming_file(path):
-        if not data.startswith(_MAGIC):
-            return _unzip(data)[0], {"all": len(data)}
-        header, lengths = _table(data)
-    return header, {"header": len(data) - sum(lengths.values()), **lengths}
-
-
-def describe_spz(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Facts about a file, see :class:`nsvq_lightning.io.formats.Format`; errors as of :func:`read_spz_header`."""
-    header, sizes = read_spz_header(path)
-    axes = header.axes or f"not stated, taken as {DEFAULT_AXES.upper()}"
-    encoding = "zstd" if header.version == 4 else "gzip"
-    streams = {name: ("plain" if name == "header" else encoding, size) for name, size in sizes.items()}
-    return {
-        "format": f"spz, version {header.version}, axes {axes}",
-        "splats": header.count,
-        "sh_degree": header.sh_degree,
-        "streams": streams,
-    }
 
 
 def _unpack(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
@@ -237,6 +209,8 @@ def _with_axes(header: SpzHeader, extensions: bytes) -> SpzHeader:
 
 def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
     """Header and arrays of versions 1 to 3."""
+    if not data.startswith(_GZIP):
+        raise wrong_start(".spz", data, _GZIP)
     gunzip = zlib.decompressobj(wbits=31)
     header = _parse(_inflate(gunzip, data, _HEADER.size), len(data))
     if header.version > 3:
@@ -258,7 +232,7 @@ def _inflate(gunzip: "zlib._Decompress", data: bytes, most: int) -> bytes:
     try:
         return gunzip.decompress(data, most)
     except zlib.error as error:
-        raise FormatError(f"damaged, or not a .spz file: no valid gzip stream ({error})") from None
+        raise FormatError(f"damaged: no valid gzip stream ({error})") from None
 
 
 # Bits of a position, and the largest number of them that are fractional.
@@ -268,7 +242,7 @@ _POSITION, MOST_FRACTION = 24, 30
 def _parse(start: bytes, file_bytes: int) -> SpzHeader:
     """Header of any version; refuses more splats than a file of that many bytes can hold."""
     if len(start) < _HEADER.size or start[:4] != _MAGIC:
-        raise FormatError("not a .spz file: it does not start with a whole header 'NGSP'")
+        raise wrong_start(".spz", start, _MAGIC)
     _, version, count, sh_degree, fraction_bits, flags, _ = _HEADER.unpack(start)
     if not 1 <= version <= 4:
         raise FormatError(f"version {version} of the format; this release reads 1 to 4", "save it as version 3 or .ply")

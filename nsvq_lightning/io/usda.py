@@ -3,6 +3,7 @@
 It has y up: our right, down, front turned half around z.
 """
 
+import logging
 import os
 import re
 from pathlib import Path
@@ -11,12 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_write
-from nsvq_lightning.io.compressed import HALF_TURN, CompressedScene, rotated
-from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.numbers import logits_of, opacity_of
-from nsvq_lightning.splats.conventions import sh_coefficients, unit
+from nsvq_lightning.io.compressed import HALF_TURN, UP_AXES, CompressedScene, moved, rotated
+from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
+from nsvq_lightning.io.numbers import logits_of, logs_of_lengths, opacity_of
+from nsvq_lightning.splats.conventions import sh_coefficients, shN_degree, unit
+
+log = logging.getLogger(__name__)
 
 _ROWS = 1 << 12
+BINARY_REMEDY = "write it as text: usdcat -o scene.usda FILE"
 PRIM = "ParticleField3DGaussianSplat"
 _COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
 
@@ -65,33 +69,60 @@ def write_usda(path: str | os.PathLike[str], scene: CompressedScene) -> int:
 
 
 def read_usda(path: str | os.PathLike[str]) -> CompressedScene:
-    """Read the splats of a ``.usda`` file with one prim of splats, with y up, at the root, without transforms.
+    """Read the splats of a ``.usda`` file with one prim of splats, without transforms.
+
+    Attributes may be half as precise (``positionsh``), or samples in time, of which the first is read. A stage with z
+    up is turned, one that states another unit than metres is scaled.
 
     Raises:
         FormatError: It is truncated, damaged or something else.
     """
-    text = Path(path).read_text(encoding="utf-8", errors="replace")
+    data = Path(path).read_bytes()
     with naming_file(path):
-        if not text.startswith("#usda") or text.count(f"def {PRIM}") != 1 or "xformOp" in text:
-            raise FormatError(f"not a .usda file with one {PRIM} and no transforms", "export it anew, flattened")
+        if data.startswith((b"PXR-USDC", b"PK")):
+            raise FormatError("binary OpenUSD (.usdc or .usdz); only text is read", BINARY_REMEDY)
+        if not data.startswith(b"#usda"):
+            raise wrong_start(".usda", data, b"#usda")
+        text = data.decode("utf-8", "replace")
+        if (prims := len(re.findall(rf"\bdef\s+{PRIM}\b", text))) != 1:
+            raise FormatError(f"{prims} prims of the kind {PRIM}, not one", "export it anew with one")
+        if "xformOp:" in text:
+            raise FormatError("it has transforms (xformOp), which are not read", "export it anew, flattened")
+        if ".timeSamples" in text:
+            log.warning("%s changes with time: the first sample is read", path)
+        means, opacities = _rows(text, "positions", 3), _rows(text, "opacities", 1)
+        scales, quats = _rows(text, "scales", 3), _rows(text, "orientations", 4)
+        colors = _rows(text, _COEFFICIENTS, 3)
+        config = {"antialiased": True} if "bool antialiased = 1" in text else {}
+        try:
+            colors = colors.reshape(len(means), -1)
+            degree = shN_degree(colors.shape[1] // 3 - 1)
+            raw = {"quats": quats, "scales": logs_of_lengths(scales), "sh0": colors[:, :3], "shN": colors[:, 3:]}
+            scene = CompressedScene(means, logits_of(opacities[:, 0]), raw=raw, sh_degree=degree, config=config)
+            return moved(scene, _to_ours(text))
+        except ValueError as error:
+            raise FormatError(f"truncated or damaged: {error}") from None
 
-        def rows(name: str, width: int) -> NDArray[np.float32]:
-            found = re.search(rf"\[\] {name} = \[([^\]]*)\]", text)
-            numbers = [] if found is None else re.sub(r"[(),]", " ", found[1]).split()
+
+def _rows(text: str, name: str, width: int) -> NDArray[np.float32]:
+    """Rows ``[N, width]`` of an attribute, in full or in half precision."""
+    for each in (name, f"{name}h"):
+        value = r"(?:=|\.timeSamples\s*=\s*\{[^:\[]*:)\s*\[([^\]]*)\]"
+        if found := re.search(rf"\[\]\s*{each}\s*{value}", text):
+            numbers = re.sub(r"[(),]", " ", found[1]).split()
             try:
                 return np.array(numbers, np.float64).astype(np.float32).reshape(-1, width)
             except ValueError as error:
                 raise FormatError(f"damaged: {name} ({error})") from None
+    raise FormatError(f"truncated: {name} has no end" if name in text else f"no attribute {name}")
 
-        means, logits = rows("positions", 3), logits_of(rows("opacities", 1)[:, 0])
-        scales = np.log(rows("scales", 3).clip(np.finfo(np.float32).tiny))
-        stated = re.search(r"radiance:sphericalHarmonicsDegree = ([0-3])\b", text)
-        degree = int(stated[1]) if stated else 0
-        try:
-            colors = rows(_COEFFICIENTS, 3).reshape(len(means), 3 + 3 * sh_coefficients(degree))
-            raw = {"quats": rows("orientations", 4), "scales": scales, "sh0": colors[:, :3], "shN": colors[:, 3:]}
-            config = {"antialiased": True} if "bool antialiased = 1" in text else {}
-            scene = CompressedScene(means, logits, raw=raw, sh_degree=degree, config=config)
-        except ValueError as error:
-            raise FormatError(f"truncated or damaged: {error}") from None
-    return rotated(scene, HALF_TURN)
+
+def _to_ours(text: str) -> NDArray[np.float64]:
+    """What takes the axes and the unit of the stage to ours, and to metres where it states a unit ``[4, 4]``."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = HALF_TURN
+    if re.search(r'\bupAxis\s*=\s*"Z"', text):
+        matrix[:3, :3] = HALF_TURN @ UP_AXES["z"]
+    if found := re.search(r"\bmetersPerUnit\s*=\s*([-+.\deE]+)", text):
+        matrix[:3, :3] *= float(found[1])
+    return matrix

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compressed_scenes import arrays_of
-from viewer_scenes import WRITTEN, coded_scene, nearest_in, needs_zstd, plain_scene
+from viewer_scenes import WRITTEN, coded_scene, nearest_in, needs_zstd, plain_scene, read_spz_header
 
 from nsvq_lightning.commands.main import main as nsvq
 from nsvq_lightning.data.colmap import find_model, import_pycolmap
@@ -16,7 +16,6 @@ from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import CompressedScene, read_scene, save
 from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
-from nsvq_lightning.io.spz import read_spz_header
 from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.splats.splats import Splats
 from tests.support.splat_scenes import ball
@@ -97,7 +96,7 @@ def test_version_and_axes_of_spz_are_chosen(tmp_path: Path, caplog: pytest.LogCa
         (["--spz-version", "4"], 4, "RDF"),
     ):
         assert main([str(tmp_path / "a.nsvq"), str(tmp_path / "b.spz"), *options]) == 0
-        header, _ = read_spz_header(tmp_path / "b.spz")
+        header = read_spz_header(tmp_path / "b.spz")
         assert (header.version, header.axes, caplog.text) == (version, axes, "")
 
 

@@ -1,4 +1,4 @@
-"""The ``nsvq`` command before anything runs: version, help, settings that cannot be; and the script ``lightning``."""
+"""The ``nsvq`` command before anything runs: version, help, settings and scenes that cannot be; and ``lightning``."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from contextlib import redirect_stdout
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from viewer_scenes import plain_scene
 
 import nsvq_lightning
 from nsvq_lightning.callbacks import STANDARD
@@ -25,6 +27,7 @@ from nsvq_lightning.commands.arguments import FIT_HELP, check_early
 from nsvq_lightning.commands.fit import SplatCLI, class_help
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.commands.registry import COMMANDS
+from nsvq_lightning.io import write_ply
 
 
 @pytest.mark.parametrize(("argument", "said"), [("--version", nsvq_lightning.__version__), ("--help", "benchmark")])
@@ -361,3 +364,29 @@ def test_without_another_distribution_the_known_words_are_listed(
     assert "unknown command 'login'" in message
     assert "fit, test, validate, predict" in message
     assert message.count("\n") == 1
+
+
+@pytest.mark.parametrize("count", [0, 3])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "info x.ply",
+        "convert x.ply y.sog",
+        "convert x.ply y.ply",
+        "compress x.ply y.nsvq",
+        "render x.ply -o y.mp4",
+        "view x.ply --no-open",
+    ],
+)
+def test_no_command_goes_on_with_an_empty_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str, count: int
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scene = plain_scene(count, 0)
+    scene.raw["scales"][:] = np.inf
+    write_ply("x.ply", scene)
+    assert main(command.split()) == 1
+    reason = " (scales in 3 rows are not)" if count else ""
+    error = f"nsvq {command.split()[0]}: x.ply: no finite splat among {count}{reason}; give a scene with splats\n"
+    assert capsys.readouterr().err.endswith(error)
+    assert [path.name for path in tmp_path.iterdir()] == ["x.ply"]

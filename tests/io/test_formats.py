@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from viewer_scenes import WRITTEN, coded_scene
+from viewer_scenes import WRITTEN, coded_scene, plain_scene
 
 from nsvq_lightning import Splats, load, save
-from nsvq_lightning.io import CompressedScene, FormatError
+from nsvq_lightning.io import CompressedScene, FormatError, read_scene
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.random import generator
 
@@ -91,3 +91,29 @@ def test_an_origin_is_not_lost_silently(tmp_path: Path, caplog: pytest.LogCaptur
         assert caplog.text == ""
         step()
         assert "4000000.0" in caplog.text
+
+
+@pytest.mark.parametrize("suffix", sorted(WRITTEN))
+@pytest.mark.parametrize("count", [0, 3])
+def test_nothing_is_saved_of_a_scene_without_finite_splats(tmp_path: Path, suffix: str, count: int) -> None:
+    empty = plain_scene(count, 1)
+    empty.means[:, 0] = np.nan
+    with pytest.raises(FormatError, match=rf"x{suffix}: no finite splat among {count}"):
+        save(empty, tmp_path / f"x{suffix}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_splats_without_a_rotation_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    still = plain_scene(9, 0)
+    still.raw["quats"][[2, 5]] = 0
+    save(still, tmp_path / "x.ply")
+    assert len(read_scene(tmp_path / "x.ply")) == 9
+    assert "x.ply: 2 of 9 splats have the rotation 0 0 0 0" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "way"), [("a.usdz", "usdcat"), ("a.USDC", "usdcat"), ("a.ksplat", "splat-transform"), ("a.gltf", ".glb")]
+)
+def test_what_turns_other_files_into_some_that_are_read_is_said(name: str, way: str) -> None:
+    with pytest.raises(ValueError, match=rf"unknown suffix .*; .*{way}"):
+        read_scene(name)

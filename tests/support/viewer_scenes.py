@@ -11,7 +11,7 @@ import pytest
 from compressed_scenes import scene_of
 from numpy.typing import NDArray
 
-from nsvq_lightning.io import FORMATS, CompressedScene
+from nsvq_lightning.io import FORMATS, CompressedScene, spz
 
 WRITTEN = [suffix for suffix, entry in FORMATS.items() if entry.write is not None]
 """Formats that are written; all are read."""
@@ -65,6 +65,12 @@ def angles(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64
 
 def sigmoid(logits: NDArray[np.float32]) -> NDArray[np.float64]:
     return 1 / (1 + np.exp(-logits.astype(np.float64)))
+
+
+def read_spz_header(path: Path) -> spz.SpzHeader:
+    """Header of any version; needs no Zstandard."""
+    data = path.read_bytes()
+    return spz._table(data)[0] if data.startswith(b"NGSP") else spz._unzip(data)[0]
 
 
 def read_table(path: Path) -> SimpleNamespace:

@@ -80,10 +80,7 @@ def workloads(scope: Scope) -> list[Workload]:
         return [synthetic_workload(name) for name in scope.workloads]
     name, scene = path.resolve().name, None if scope.photos is None else load_scene(scope.photos)
     if file is not None:
-        found = read_scene(file).finite()
-        if len(found) == 0:
-            raise ValueError(f"{file} holds no splat with finite numbers; there is nothing to measure")
-        splats = detached(found.decode())
+        splats = detached(read_scene(file).decode())
         name += f" {file.name}" if scene is not None else ""
     elif scene is not None:
         scene = scene.standard

@@ -251,16 +251,18 @@ def read_header(path: str | os.PathLike[str]) -> Header:
 
 
 def describe_nsvq(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Facts about a file, see :class:`nsvq_lightning.io.formats.Format`; errors are those of :func:`read_header`."""
+    """Facts about a file, as JSON values; errors are those of :func:`read_header`."""
     header, total = read_header(path), os.path.getsize(path)
-    header_bytes = total - sum(stream.length for stream in header.streams)
+    parts = [("header", "json", total - sum(stream.length for stream in header.streams))]
+    parts += [(stream.name, stream.encoding, stream.length) for stream in header.streams]
     return {
         "format": f"nsvq, level {header.level}",
         "splats": header.splats,
         "sh_degree": header.sh_degree,
         "origin": list(header.origin),
         "attributes": [{**entry._asdict(), "bits": entry.bits} for entry in header.attributes],
-        "streams": {"header": ("json", header_bytes)} | {s.name: (s.encoding, s.length) for s in header.streams},
+        "streams": [{"name": name, "encoding": encoding, "bytes": size} for name, encoding, size in parts],
+        "bytes": total,
         "config": header.config,
         "metrics": header.metrics,
     }
