@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import CompressedScene, in_morton_order
-from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.numbers import finite_logits, logits_of_bytes, opacity_of
+from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
+from nsvq_lightning.io.numbers import FLAT, finite_logits, logits_of_bytes, opacity_of
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
 from nsvq_lightning.splats.conventions import SH_C0, from_smallest_three, shN_degree, smallest_three, unit
 
@@ -64,7 +64,7 @@ def read_ply_header(path: str | os.PathLike[str]) -> PlyHeader:
         FormatError: The header is truncated or malformed, or has no vertices; or the rest is truncated.
     """
     with naming_file(path), open(path, "rb") as file:
-        header, file_bytes = _parsed(file.read(1 << 20)), os.fstat(file.fileno()).st_size
+        header, file_bytes = _parsed(file), os.fstat(file.fileno()).st_size
         # An ascii value takes at least one digit and one separator; the last separator may be missing.
         row_bytes = 2 * len(header.properties) if header.encoding == "ascii" else header.dtype.itemsize
         needed = header.offset + header.count * row_bytes - (header.encoding == "ascii" and header.count > 0)
@@ -81,26 +81,32 @@ _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
-    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8", "half": "f2", "float16": "f2"},
 }
 # Properties of a compressed ``.ply``, and the attributes in them; the opacity is in the colour.
 _PACKED = {"packed_position": "means", "packed_rotation": "quats", "packed_scale": "scales", "packed_color": "sh0"}
 # Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene.
 _ROWS = 1 << 12
+# Of a header; some programs write their cameras into its comments.
+_MOST_HEADER = 1 << 26
 
 
-def _parsed(start: bytes) -> PlyHeader:
-    """Header from the first bytes of a file."""
-    end = re.search(rb"\nend_header[ \t]*\r?\n", start)
+def _parsed(file: BinaryIO) -> PlyHeader:
+    """Header of a file."""
+    start = file.read(1 << 16)
     if not re.match(rb"ply[ \t]*\r?\n", start):
-        raise FormatError("not a .ply file: it does not start with the line 'ply'")
+        raise wrong_start(".ply", start, b"ply")
+    while (end := re.search(rb"\nend_header[ \t]*\r?\n", start)) is None and len(start) < _MOST_HEADER:
+        if not (more := file.read(len(start))):
+            break
+        start += more
     if end is None:
         raise FormatError("truncated or damaged: the header has no end_header line")
     lines = [line.split() for line in start[: end.start()].decode("latin-1").split("\n")[1:]]
     formats = [line[1] for line in lines if line and line[0] == "format" and len(line) > 1]
     if len(formats) != 1 or formats[0] not in _BYTE_ORDER:
         raise FormatError(f"the header needs one format line with {', '.join(_BYTE_ORDER)}; got {formats}")
-    elements = _elements(lines, formats[0], end.end())
+    elements = _elements(lines, formats[0], end.end(), file)
     if "vertex" not in elements:
         raise FormatError("the header has no element vertex")
     # The last comment that says how the splats were trained counts.
@@ -110,36 +116,56 @@ def _parsed(start: bytes) -> PlyHeader:
     return replace(elements.pop("vertex"), antialiased=antialiased, others=elements)
 
 
-def _elements(lines: list[list[str]], encoding: str, offset: int) -> dict[str, PlyHeader]:
+# What a point cloud editor (CloudCompare) puts before the names that it does not know.
+_PREFIX = "scalar_"
+
+
+def _elements(lines: list[list[str]], encoding: str, offset: int, file: BinaryIO) -> dict[str, PlyHeader]:
     """The elements by name up to the first list after the vertices, whose length varies."""
-    fields: list[tuple[str, int, list[tuple[str, str]]]] = []
+    order = _BYTE_ORDER[encoding]
+    fields: list[tuple[str, int, list[tuple[str, ...]]]] = []
     for line in lines:
         match line:
             case [] | ["comment" | "obj_info" | "format", *_]:
                 pass
             case ["element", name, number] if re.fullmatch(r"[0-9]{1,15}", number):
                 fields.append((name, int(number), []))
-            case ["property", "list", _, _, name] if fields:
-                fields[-1][2].append((name, "list"))
+            case ["property", "list", length, kind, name] if fields and {length, kind} <= _TYPES.keys():
+                fields[-1][2].append((name, order + _TYPES[kind], order + _TYPES[length]))
             case ["property", kind, name] if fields and kind in _TYPES:
-                fields[-1][2].append((name, _BYTE_ORDER[encoding] + _TYPES[kind]))
+                fields[-1][2].append((name.removeprefix(_PREFIX), order + _TYPES[kind]))
             case _:
                 raise FormatError(f"bad header line {' '.join(line)[:80]!r}")
     found: dict[str, PlyHeader] = {}
     before = 0
     for name, count, properties in fields:
-        if any(kind == "list" for _, kind in properties):
+        if any(len(each) > 2 for each in properties):
             if "vertex" in found:
                 break
-            raise FormatError(f"element {name} holds lists; points and splats have plain numbers only")
-        if doubled := sorted(a for a, b in pairwise(sorted(name for name, _ in properties)) if a == b):
-            raise FormatError(f"element {name} has the property {doubled[0]!r} twice")
-        found[name] = PlyHeader(encoding, count, np.dtype(properties), offset, before)
-        if encoding == "ascii":
-            before += count
+            if name == "vertex":
+                raise FormatError("element vertex holds lists; points and splats have plain numbers only")
+            if encoding != "ascii":
+                offset = _end_of_lists(file, offset, count, properties)
         else:
-            offset = found[name].end
+            if doubled := sorted(a for a, b in pairwise(sorted(each[0] for each in properties)) if a == b):
+                raise FormatError(f"element {name} has the property {doubled[0]!r} twice")
+            found[name] = PlyHeader(encoding, count, np.dtype(properties), offset, before)
+            if encoding != "ascii":
+                offset = found[name].end
+        before += count
     return found
+
+
+def _end_of_lists(file: BinaryIO, offset: int, count: int, properties: list[tuple[str, ...]]) -> int:
+    """The byte after the rows of an element with lists, whose lengths only the rows themselves say."""
+    file.seek(offset)
+    for _ in range(count):
+        for _, kind, *length in properties:
+            number = np.fromfile(file, length[0], 1) if length else np.ones(1)
+            if not number.size:
+                raise FormatError(f"truncated: {count} rows of lists before the vertices end beyond the file")
+            file.seek(max(0, int(number[0])) * np.dtype(kind).itemsize, os.SEEK_CUR)
+    return file.tell()
 
 
 def splat_columns(sh_degree: int) -> dict[str, list[str]]:
@@ -162,7 +188,7 @@ def splat_degree(header: PlyHeader) -> int:
         names = header.others["sh"].properties if "sh" in header.others else ()
     else:
         names = header.properties
-        missing = [name for columns in splat_columns(0).values() for name in columns if name not in names]
+        missing = [name for columns in _needed(header, 0).values() for name in columns if name not in names]
         if missing:
             raise FormatError(f"not a .ply of Gaussian splats: it has no property {', '.join(missing)}")
     rest = [name for name in names if name.startswith("f_rest_")]
@@ -171,6 +197,27 @@ def splat_degree(header: PlyHeader) -> int:
         got = f"{len(rest)}, among them {strange[0]}" if strange else f"{len(rest)}"
         raise FormatError(f"SH degrees 0 to 3 have 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ...; got {got}")
     return shN_degree(len(rest) // 3)
+
+
+_RGB = ["red", "green", "blue"]
+
+
+def _needed(header: PlyHeader, sh_degree: int) -> dict[str, list[str]]:
+    """Properties to read of each attribute: discs may have no third scale, splats colours in place of coefficients."""
+    columns, names = splat_columns(sh_degree), header.properties
+    if "scale_2" not in names:
+        columns["scales"] = columns["scales"][:2]
+    if columns["sh0"][0] not in names and set(_RGB) <= set(names):
+        columns["sh0"] = _RGB
+    return columns
+
+
+def _coefficients(colors: NDArray[np.float32], is_float: bool) -> NDArray[np.float32]:
+    """SH coefficients of colours: floats to 1, or whole numbers to 255 or 65535, as the numbers themselves tell."""
+    full = 255 if colors.max(initial=0) <= 255 else 65535
+    if is_float and np.median(colors) <= 1:
+        full = 1
+    return ((colors / full - 0.5) / SH_C0).astype(np.float32)
 
 
 def _check_packed(header: PlyHeader) -> None:
@@ -191,37 +238,13 @@ def _check_packed(header: PlyHeader) -> None:
         )
 
 
-def describe_ply(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Facts about a file, see :class:`nsvq_lightning.io.formats.Format`.
-
-    Raises:
-        FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.
-    """
-    header, total = read_ply_header(path), os.path.getsize(path)
-    with naming_file(path):
-        sh_degree = splat_degree(header)
-    names = {column: name for name, columns in splat_columns(3).items() for column in columns} | _PACKED
-    sizes: dict[str, int] = {}
-    for table in [header, *([header.others["sh"]] if header.packed and "sh" in header.others else [])]:
-        for column in table.properties:
-            name = names.get(column, "other")
-            sizes[name] = sizes.get(name, 0) + table.count * table.dtype[column].itemsize
-    streams = {"header": ("plain", total - sum(sizes.values()))} | {name: ("ply", size) for name, size in sizes.items()}
-    return {
-        "format": f"ply, {'compressed' if header.packed else header.encoding}",
-        "splats": header.count,
-        "sh_degree": sh_degree,
-        # The lengths of ascii numbers vary, so only the total is known.
-        "streams": {"text": ("ply", total)} if header.encoding == "ascii" else streams,
-    }
-
-
 def read_ply(path: str | os.PathLike[str]) -> CompressedScene:
     """Read the splats of a ``.ply`` file.
 
     Properties may come in any order and any number type, binary (either byte order) or ascii; with or without normals.
-    The number of ``f_rest`` properties gives the SH degree, 0 to 3; other properties and elements are skipped. A
-    compressed ``.ply`` of PlayCanvas is known by its header.
+    The number of ``f_rest`` properties gives the SH degree, 0 to 3; other properties and elements are skipped. Discs
+    (a third scale of -inf, or none) get the thickness :data:`~nsvq_lightning.io.numbers.FLAT`; ``red green blue`` stand
+    in for ``f_dc_0`` to 2. A compressed ``.ply`` of PlayCanvas is known by its header.
 
     Raises:
         FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.
@@ -238,7 +261,7 @@ def read_ply(path: str | os.PathLike[str]) -> CompressedScene:
 
 def _read_plain(path: str | os.PathLike[str], header: PlyHeader, sh_degree: int) -> dict[str, NDArray[np.float32]]:
     """Rows ``[N, D]`` of each attribute."""
-    columns = splat_columns(sh_degree)
+    columns = _needed(header, sh_degree)
     raw = {name: np.empty((header.count, len(names)), np.float32) for name, names in columns.items()}
     ends = np.cumsum([len(names) for names in columns.values()])
     start = 0
@@ -246,6 +269,10 @@ def _read_plain(path: str | os.PathLike[str], header: PlyHeader, sh_degree: int)
         for name, part in zip(raw, np.split(table, ends[:-1], axis=1), strict=True):
             raw[name][start : start + len(table)] = _by_coefficient(part) if name == "shN" else part
         start += len(table)
+    if columns["sh0"] == _RGB:
+        raw["sh0"] = _coefficients(raw["sh0"], header.dtype["red"].kind == "f")
+    thickness = np.full((header.count, 3 - raw["scales"].shape[1]), FLAT, np.float32)
+    raw["scales"] = np.concatenate([raw["scales"], thickness], axis=1).clip(FLAT)
     # Writers that store opacity as a byte make 0 and 255 infinite logits.
     return raw | {"opacities": finite_logits(raw["opacities"])}
 

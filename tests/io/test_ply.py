@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from compressed_scenes import arrays_of, scene_of
 
-from nsvq_lightning.io import CompressedScene, FormatError, read_ply, write_ply
+from nsvq_lightning.io import CompressedScene, FormatError, read_ply, read_scene, write_ply
 from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
 
@@ -128,7 +128,7 @@ def test_every_truncation_is_one_clear_error(tmp_path: Path) -> None:
         (b"vertex 2", b"points 2", "no element vertex"),
         (b"binary_little_endian", b"binary_middle_endian", "format line"),
         (b"property float opacity\n", b"", "no property opacity"),
-        (b"property float opacity", b"property half opacity", "bad header line"),
+        (b"property float opacity", b"property quad opacity", "bad header line"),
         (b"property float opacity", b"property list uchar float opacity", "holds lists"),
         (b"property float nx", b"property float x", "'x' twice"),
         (b"property float f_rest_8\n", b"", "0, 9, 24 or 45"),
@@ -193,3 +193,94 @@ def test_damaged_compressed_ply(tmp_path: Path, data: bytes, message: str) -> No
     path.write_bytes(data)
     with pytest.raises(FormatError, match=rf"x\.ply: .*{message}"):
         read_ply(path)
+
+
+def _changed(path: Path, splats: CompressedScene, *changes: tuple[bytes, bytes], rows: bytes = b"") -> CompressedScene:
+    """What is read of the file of splats with another header, and with bytes before its rows."""
+    write_ply(path, splats)
+    head, end, body = path.read_bytes().partition(b"end_header\n")
+    for old, new in changes:
+        assert old in head
+        head = head.replace(old, new)
+    path.write_bytes(head + end + rows + body)
+    return read_scene(path)
+
+
+def _columns(path: Path, columns: dict[str, np.ndarray]) -> CompressedScene:
+    """What is read of a file with these columns."""
+    names = {"f4": "float", "u1": "uchar", "u2": "ushort", "f2": "half", "f8": "double"}
+    rows = np.rec.fromarrays(list(columns.values()), names=list(columns))
+    properties = [f"{names[rows.dtype[name].str[1:]]} {name}" for name in columns]
+    path.write_bytes(_header(properties, len(rows)) + rows.tobytes())
+    return read_scene(path)
+
+
+def test_names_with_the_prefix_of_a_point_cloud_editor_are_known(tmp_path: Path) -> None:
+    splats = scene(4, 1)
+    changes = [(b"float " + name, b"float scalar_" + name) for name in (b"f_", b"opacity", b"scale_", b"rot_")]
+    assert_same(_changed(tmp_path / "x.ply", splats, *changes), splats)
+
+
+def test_discs_are_read_with_next_to_no_thickness(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    splats = scene(5, 0)
+    columns = {name: np.array([_values(splats, row)[name] for row in range(5)], "<f4") for name in _names(0)}
+    thin = np.full(5, np.log(np.finfo(np.float32).tiny))
+    flat = _columns(tmp_path / "x.ply", columns | {"scale_2": np.full(5, -np.inf, "<f4")})
+    np.testing.assert_allclose(flat.values("scales"), np.c_[splats.values("scales")[:, :2], thin], rtol=1e-6)
+    assert_same(_columns(tmp_path / "y.ply", {name: columns[name] for name in columns if name != "scale_2"}), flat)
+    assert not caplog.text
+    odd = columns | {"scale_0": np.array([0, np.inf, np.nan, 0, -np.inf], "<f4")}
+    assert len(_columns(tmp_path / "z.ply", odd)) == 3
+    assert "dropped 2 of 5 splats with non-finite values: scales in 2 rows" in caplog.text
+
+
+@pytest.mark.parametrize(("kind", "full"), [("u1", 255), ("u2", 65535), ("u2", 255), ("f4", 1), ("f4", 255), ("f8", 1)])
+def test_colours_stand_in_for_coefficients(tmp_path: Path, kind: str, full: int) -> None:
+    """Oracle: colour = 0.5 + f_dc / (2 √π)."""
+    splats, colors = scene(4, 0), np.array([[0, 0.2, 1], [0.4, 1, 0.6], [1, 0, 0], [0.8, 0.2, 0]])
+    columns = {name: np.array([_values(splats, row)[name] for row in range(4)], "<f4") for name in _names(0)}
+    for name in ("f_dc_0", "f_dc_1", "f_dc_2"):
+        del columns[name]
+    columns |= dict(zip(("red", "green", "blue"), (full * colors).astype(kind).T, strict=True))
+    read = _columns(tmp_path / "x.ply", columns)
+    np.testing.assert_allclose(0.5 + read.values("sh0")[:, 0] / np.sqrt(4 * np.pi), colors, atol=1e-6)
+
+
+def test_half_precision(tmp_path: Path) -> None:
+    splats = scene(4, 0)
+    columns = {name: np.array([_values(splats, row)[name] for row in range(4)], "<f2") for name in _names(0)}
+    read = _columns(tmp_path / "x.ply", columns)
+    for name in ATTRIBUTES:
+        np.testing.assert_array_equal(read.values(name), splats.values(name).astype(np.float16))
+
+
+def test_lists_before_and_after_the_vertices_are_passed_over(tmp_path: Path) -> None:
+    splats, path = scene(3, 0), tmp_path / "x.ply"
+    faces = b"element face %d\nproperty uchar kind\nproperty list uchar int corners\nelement vertex"
+    after = (b"property float rot_3\n", b"property float rot_3\nelement edge 0\nproperty list int float ends\n")
+    assert_same(_changed(path, splats, (b"element vertex", faces % 0), after), splats)
+    rows = struct.pack("<BBiiiBB", 7, 3, 0, 1, 2, 7, 0)
+    assert_same(_changed(path, splats, (b"element vertex", faces % 2), rows=rows), splats)
+    names = _names(0)
+    lines = [" ".join(repr(_values(splats, row)[name]) for name in names) for row in range(3)]
+    head = _header([f"float {name}" for name in names], 3, "ascii", (faces % 2).decode().removesuffix("element vertex"))
+    path.write_bytes(head + "\n".join(["7 3 0 1 2", "7 0", *lines]).encode())
+    assert_same(read_ply(path), splats)
+    for length in (b"\xff", b""):
+        with pytest.raises(FormatError, match=r"x\.ply: truncated"):
+            _changed(path, splats, (b"vertex 3", b"vertex 0"), (b"element vertex", faces % 2), rows=b"\7" + length)
+
+
+def test_a_header_may_be_long(tmp_path: Path) -> None:
+    splats, comments = scene(2, 0), b"".join(b"comment camera %d\n" % number for number in range(70_000))
+    assert len(comments) > 1 << 20
+    assert_same(_changed(tmp_path / "x.ply", splats, (b"element vertex", comments + b"element vertex")), splats)
+
+
+def test_only_damaged_files_are_to_be_copied_again(tmp_path: Path) -> None:
+    path = tmp_path / "x.ply"
+    for content, again in ((b"pl", True), (b"ply\nformat", True), (b"solid x", False), (_header(["int x"], 0), False)):
+        path.write_bytes(content)
+        with pytest.raises(FormatError) as caught:
+            read_scene(path)
+        assert ("copy the file again" in str(caught.value)) == again, content
