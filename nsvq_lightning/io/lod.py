@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from nsvq_lightning.io.atomic import atomic_write, write_text
 from nsvq_lightning.io.compressed import CompressedScene, joined
 from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.sog import META, PALETTE_LIMIT, describe_sog, read_sog, sog_contents
+from nsvq_lightning.io.sog import META, PALETTE_LIMIT, read_sog, sog_contents
 from nsvq_lightning.splats.conventions import unit
 
 NAME = "lod-meta.json"
@@ -83,7 +83,8 @@ def write_lod(
     about = {"version": 1, "asset": {"generator": "nsvq-lightning"}, "count": sum(counts), "counts": counts}
     index = json.dumps(about | {"lodLevels": len(levels), "filenames": names, "tree": tree}, separators=(",", ":"))
     write_text(target, index)
-    for folder in {name.partition("/")[0] for name in old} - {name.partition("/")[0] for name in names}:
+    ours = {name.partition("/")[0] for name in names}
+    for folder in {name.partition("/")[0] for name in old if name.count("/") == 1} - ours:
         shutil.rmtree(target.parent / folder, ignore_errors=True)
     return total + len(index)
 
@@ -158,58 +159,48 @@ def _files(runs: list[NDArray[np.intp]]) -> Iterator[list[int]]:
 _MOST_BYTES = 1 << 26
 
 
-def _index(path: Path) -> dict[str, Any]:
-    """The checked content of ``lod-meta.json``."""
+def _index(path: Path) -> dict[str, list[str]]:
+    """Of ``lod-meta.json``: ``filenames``, and those ``shown``, of the finest level and what surrounds the scene."""
     with naming_file(path):
         if path.stat().st_size > _MOST_BYTES:
             raise FormatError(f"damaged: an index cannot have {path.stat().st_size} bytes")
         try:
             index = json.loads(path.read_bytes())
-            names, nodes = [PurePosixPath(name) for name in index["filenames"]], [index["tree"]]
+            names, nodes = [str(PurePosixPath(name)) for name in index["filenames"]], [index["tree"]]
             finest: dict[int, None] = {}
             while nodes:
                 node = nodes.pop()
                 nodes += reversed(node.get("children", ()))
                 if "0" in node.get("lods", {}):
                     finest[range(len(names))[node["lods"]["0"]["file"]]] = None
+            shown = [names[number] for number in finest]
+            if around := index.get("environment"):
+                shown.append(str(PurePosixPath(around)))
         except (ValueError, RecursionError, KeyError, TypeError, IndexError, AttributeError) as error:
             raise FormatError(f"damaged: not the index of a streamed SOG ({error!r})") from None
-        if strange := [str(name) for name in names if len(name.parts) != 2 or ".." in name.parts or name.name != META]:
-            raise FormatError(f"damaged: {strange[0][:80]!r} is no FOLDER/{META} beside it")
+        if strange := [name for name in (*names, *shown) if not _is_beside(PurePosixPath(name))]:
+            raise FormatError(f"damaged: {strange[0][:80]!r} is no FOLDER/{META} or .sog beside it")
         if not finest:
             raise FormatError("damaged: no leaf has splats of level 0")
-        if absent := [str(name) for name in names if not (path.parent / name).is_file()]:
+        if absent := [name for name in shown if not (path.parent / name).is_file()]:
             raise FormatError(f"incomplete: {absent[0]} is missing", "copy the whole folder again")
-        if index.get("version") != 1:
-            raise FormatError(f"version {str(index.get('version'))[:40]} of the format; this release reads version 1")
-    return {**index, "finest": list(finest)}
+        if (version := index.get("version", 1)) != 1:  # the first writers stated none
+            raise FormatError(f"version {str(version)[:40]} of the format; this release reads version 1")
+    return {"filenames": names, "shown": shown}
+
+
+def _is_beside(name: PurePosixPath) -> bool:
+    """Whether a name is that of a SOG in the folder of the index, or below it."""
+    return not name.is_absolute() and ".." not in name.parts and (name.name == META or name.suffix == ".sog")
 
 
 def read_lod(path: str | os.PathLike[str]) -> CompressedScene:
-    """Read the finest level of a streamed SOG.
+    """Read the finest level of a streamed SOG, and its environment.
 
     Raises:
         FormatError: A file is truncated, altered or of another version.
         OSError: A file cannot be read.
     """
     path = Path(path)
-    index = _index(path)
-    parts = [read_sog(path.parent / index["filenames"][number]) for number in index["finest"]]
-    return replace(joined(parts), stored_bytes=sum(part.stored_bytes or 0 for part in parts))
-
-
-def describe_lod(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Facts about the files, see :class:`nsvq_lightning.io.formats.Format`; errors are those of :func:`read_lod`."""
-    path = Path(path)
-    index = _index(path)
-    found = [describe_sog(path.parent / name) for name in index["filenames"]]
-    streams = {NAME: ("json", path.stat().st_size)}
-    streams |= {name: ("sog", facts["bytes"]) for name, facts in zip(index["filenames"], found, strict=True)}
-    finest = [found[number] for number in index["finest"]]
-    return {
-        "format": f"streamed sog, {index.get('lodLevels', 1)} levels",
-        "splats": sum(facts["splats"] for facts in finest),
-        "sh_degree": max((facts["sh_degree"] for facts in finest), default=0),
-        "streams": streams,
-        "bytes": sum(size for _, size in streams.values()),
-    }
+    parts = [read_sog(path.parent / name) for name in _index(path)["shown"]]
+    return replace(joined(parts), stored_bytes=path.stat().st_size + sum(part.stored_bytes or 0 for part in parts))

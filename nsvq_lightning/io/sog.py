@@ -1,6 +1,7 @@
 """The ``.sog`` file of PlayCanvas, version 2: byte images that a web page can pass to the GPU unchanged.
 
-A zip archive, or a folder, of ``meta.json`` and lossless WebP pictures.
+A zip archive, or a folder, of ``meta.json`` and lossless WebP pictures. Version 1 is read, too: in place of level
+indices it has 255ths of the way from a smallest to a largest number, and the opacity is one of them, a logit.
 
 ==================  ===========================================================================================
 picture             texel
@@ -20,6 +21,7 @@ depends only on the decoded splats: a scene gives the same file with its codeboo
 
 import io
 import json
+import logging
 import math
 import os
 import struct
@@ -35,10 +37,12 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import CompressedScene, in_morton_order
-from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, check_room, naming_file
+from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, check_room, naming_file, wrong_start
 from nsvq_lightning.io.numbers import logits_of_bytes, opacity_of
 from nsvq_lightning.io.scalar_kmeans import nearest_level, scalar_kmeans
 from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficients, smallest_three, unit
+
+log = logging.getLogger(__name__)
 
 META = "meta.json"
 # Number of rows that a 16-bit label can address.
@@ -46,6 +50,7 @@ PALETTE_LIMIT = 1 << 16
 _ROWS_A_LINE = 64
 _LEVELS = 256
 _LARGEST = float(np.finfo(np.float32).max)
+_ZIP = b"PK\x03\x04"
 
 
 def picture_shape(count: int) -> tuple[int, int]:
@@ -137,10 +142,10 @@ class _Archive:
     """The content of a ``.sog`` file: what ``meta.json`` says, and texels.
 
     Attributes:
-        meta: Content of ``meta.json``.
+        meta: Content of ``meta.json``; that of version 1 with what version 2 says and its pictures show.
+        version: 1 or 2.
         count: Number of splats.
         sh_degree: Degree of the spherical harmonics, 0 to 3.
-        sizes: Compressed size in bytes of each entry, by name.
 
     Raises:
         FormatError: It is truncated, altered, of another version, or not a zip archive with a ``meta.json``.
@@ -148,11 +153,12 @@ class _Archive:
 
     def __init__(self, data: bytes) -> None:
         self._size = len(data)
+        if not data.startswith(_ZIP):
+            raise wrong_start(".sog", data, _ZIP)
         try:
             self._zip = zipfile.ZipFile(io.BytesIO(data))
         except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError) as error:
-            raise FormatError(f"truncated, or not a .sog file: no valid zip archive ({error})") from None
-        self.sizes = {entry.filename: entry.compress_size for entry in self._zip.infolist()}
+            raise FormatError(f"truncated: no valid zip archive ({error})") from None
         text = self._bytes(META, 1 << 20)
         try:
             self.meta = json.loads(text)
@@ -160,12 +166,18 @@ class _Archive:
             raise FormatError(f"damaged: {META} is not JSON ({error})") from None
         if not isinstance(self.meta, dict):
             raise FormatError(f"damaged: {META} is not a JSON object")
-        if (version := self.meta.get("version", 1)) != 2:
-            raise FormatError(
-                f"version {version} of the format; this release reads version 2", "save it as that or as .ply"
-            )
+        self.version = self.meta.get("version", 1)
+        if self.version not in (1, 2):
+            raise FormatError(f"version {str(self.version)[:40]} of the format; this release reads 1 and 2")
+        if self.version == 1:
+            shape = self._entry("means").get("shape")
+            self.meta["count"] = shape[0] if isinstance(shape, list) and shape else None
         self.count = self._integer(self.meta, "count", 0, 1 << 40)
         check_room("splats or texels", self.count, self._size)
+        if self.version == 1 and "shN" in self.meta:  # only its picture shows how large the palette is
+            height, width = self._picture("shN", 0).shape[:2]
+            bands = {_ROWS_A_LINE * sh_coefficients(degree): degree for degree in (1, 2, 3)}.get(width)
+            self.meta["shN"] |= {"bands": bands, "count": min(_ROWS_A_LINE * height, PALETTE_LIMIT)}
         self.sh_degree = self._integer(self._entry("shN"), "bands", 0, 3) if "shN" in self.meta else 0
 
     def _bytes(self, name: str, most: int) -> bytes:
@@ -199,7 +211,8 @@ class _Archive:
 
     def _numbers(self, attribute: str, name: str, count: range, largest: float) -> NDArray[np.float64]:
         values = self._entry(attribute).get(name)
-        if not isinstance(values, list) or len(values) not in count:
+        values = values if isinstance(values, list) else [values]
+        if len(values) not in count:
             raise FormatError(f"damaged: {name!r} in {META} must be a list of {count[0]} to {count[-1]} numbers")
         if not all(type(value) in (int, float) and abs(value) <= largest for value in values):
             raise FormatError(f"damaged: {name!r} in {META} must hold numbers of at most {largest:.4g}")
@@ -207,9 +220,17 @@ class _Archive:
 
     def texels(self, attribute: str, number: int = 0, count: int | None = None) -> NDArray[np.uint8]:
         """The first ``count`` texels ``[count, 4]`` of one of the pictures of an attribute; one a splat if None."""
+        picture, count = self._picture(attribute, number), self.count if count is None else count
+        height, width = picture.shape[:2]
+        if width * height < count:
+            raise FormatError(f"damaged: a picture of {attribute} has {width} x {height} texels, {count} are needed")
+        return picture.reshape(-1, 4)[:count]
+
+    def _picture(self, attribute: str, number: int) -> NDArray[np.uint8]:
+        """One of the pictures of an attribute ``[H, W, 4]``."""
         from PIL import Image
 
-        files, count = self._entry(attribute).get("files"), self.count if count is None else count
+        files = self._entry(attribute).get("files")
         if not (isinstance(files, list) and len(files) > number and isinstance(files[number], str)):
             raise FormatError(f"damaged: {META} does not name the pictures of {attribute!r}")
         name = files[number]
@@ -217,21 +238,44 @@ class _Archive:
         data = self._bytes(name, 8 * max(FEW_SPLATS, self._size // 2))
         try:
             with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
-                if image.width * image.height < count:
-                    raise FormatError(f"damaged: {name} has {image.width} x {image.height} texels, {count} are needed")
                 check_room("splats or texels", image.width * image.height, self._size)
-                return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
+                return np.asarray(image.convert("RGBA"))
         except FormatError:
             raise
         except Exception as error:  # damage can make Pillow's decoders raise anything
             raise FormatError(f"damaged: {name} is not a picture ({error})") from None
 
     def values(self, attribute: str, texels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The values ``[N, 3]`` of an attribute that texels have the level indices of."""
-        levels, indices = self._numbers(attribute, "codebook", range(1, _LEVELS + 1), _LARGEST), texels[:, :3]
-        if indices.size and indices.max() >= len(levels):
-            raise FormatError(f"damaged: level {indices.max()} of {attribute}, there are {len(levels)}")
-        return levels.astype(np.float32)[indices]
+        """The values ``[N, C]`` of an attribute that texels ``[N, C]`` have the level indices of."""
+        if self.version == 1:
+            ends = 1 if attribute == "shN" else texels.shape[1]
+            low, high = (self._numbers(attribute, end, range(ends, ends + 1), _LARGEST) for end in ("mins", "maxs"))
+            return (low + (high - low) * (texels / 255)).astype(np.float32)
+        levels = self._levels(attribute)
+        if texels.size and texels.max() >= len(levels):
+            raise FormatError(f"damaged: level {texels.max()} of {attribute}, there are {len(levels)}")
+        return levels.astype(np.float32)[texels]
+
+    def _levels(self, attribute: str) -> NDArray[np.float64]:
+        """The codebook of an attribute; levels that are null, as older writers left NaN, in line with the others."""
+        codebook = self._entry(attribute).get("codebook")
+        if not isinstance(codebook, list) or None not in codebook:
+            return self._numbers(attribute, "codebook", range(1, _LEVELS + 1), _LARGEST)
+        from scipy.interpolate import make_interp_spline  # slow to import
+
+        log.warning("%d levels of %s are null: taken in line with those beside", codebook.count(None), attribute)
+        known = np.flatnonzero([level is not None for level in codebook])
+        self.meta[attribute]["codebook"] = [codebook[number] for number in known]
+        levels = self._numbers(attribute, "codebook", range(2, _LEVELS), _LARGEST)
+        return np.asarray(make_interp_spline(known, levels, k=1)(np.arange(len(codebook))))
+
+    def colors(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Constant coefficients ``[N, 3]`` and opacity logits ``[N]``."""
+        texels = self.texels("sh0")
+        if self.version == 1:
+            values = self.values("sh0", texels)
+            return values[:, :3], values[:, 3]
+        return self.values("sh0", texels[:, :3]), logits_of_bytes(texels[:, 3])
 
     def means(self) -> NDArray[np.float32]:
         """Positions ``[N, 3]``."""
@@ -242,19 +286,24 @@ class _Archive:
         return np.clip(np.copysign(np.expm1(np.abs(logs)), logs), -3.4e38, 3.4e38).astype(np.float32)
 
     def quats(self) -> NDArray[np.float32]:
-        """Rotations ``[N, 4]``."""
+        """Rotations ``[N, 4]``; NaN where the mark is none."""
         texels = self.texels("quats")
-        if len(texels) and texels[:, 3].min() < 252:
-            raise FormatError(f"damaged: a rotation has the mark {texels[:, 3].min()}, not 252 to 255")
+        marked = texels[:, 3] >= 252
+        if marked.sum() < 0.5 * self.count:
+            raise FormatError("damaged: most rotations have no mark of 252 to 255")
+        if not marked.all():
+            log.warning("%d of %d rotations have no mark of 252 to 255", np.sum(~marked), self.count)
         others = (texels[:, :3] / 127.5 - 1) / math.sqrt(2)
-        return from_smallest_three((texels[:, 3] - 252).astype(np.intp), others)
+        quats = from_smallest_three((texels[:, 3].clip(252) - 252).astype(np.intp), others)
+        quats[~marked] = np.nan
+        return quats
 
     def palette(self) -> tuple[NDArray[np.float32], NDArray[np.uint16]]:
         """Palette of the spherical harmonics ``[K, D]`` and the label of each splat ``[N]``."""
         rows = self._integer(self._entry("shN"), "count", 1, PALETTE_LIMIT)
         coefficients = sh_coefficients(self.sh_degree)
         centroids = self.texels("shN", 0, math.ceil(rows / _ROWS_A_LINE) * _ROWS_A_LINE * coefficients)
-        palette = self.values("shN", centroids[: rows * coefficients]).reshape(rows, 3 * coefficients)
+        palette = self.values("shN", centroids[: rows * coefficients, :3]).reshape(rows, 3 * coefficients)
         texels = self.texels("shN", 1)
         labels = texels[:, 0] + (texels[:, 1].astype(np.uint16) << 8)
         if self.count and labels.max() >= rows:
@@ -352,16 +401,18 @@ def _picture(texels: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.ui
     return picture.reshape(*shape, 4)
 
 
-def _archived(path: Path) -> bytes:
-    """The zip archive; of a folder, whose ``meta.json`` is given, one with the pictures in it."""
+def _archived(path: Path) -> tuple[bytes, int]:
+    """The zip archive and its size; of a folder, whose ``meta.json`` is given, one with the pictures in it."""
     if path.suffix.lower() != ".json":
-        return path.read_bytes()
-    buffer = io.BytesIO()
+        return path.read_bytes(), path.stat().st_size
+    buffer, text = io.BytesIO(), path.read_text(encoding="utf-8", errors="replace")
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.write(path, META)
-        for picture in sorted(path.parent.glob("*.webp")):
-            archive.write(picture, picture.name)
-    return buffer.getvalue()
+        for picture in sorted(path.parent.iterdir()):
+            if picture.suffix.lower() in (".webp", ".png") and picture.name in text:
+                archive.write(picture, picture.name)
+        size = sum(entry.file_size for entry in archive.infolist())
+    return buffer.getvalue(), size
 
 
 def read_sog(path: str | os.PathLike[str]) -> CompressedScene:
@@ -371,11 +422,14 @@ def read_sog(path: str | os.PathLike[str]) -> CompressedScene:
         FormatError: The file is truncated, altered, of another version, or not a ``.sog`` file.
     """
     with naming_file(path):
-        data = _archived(Path(path))
+        data, size = _archived(Path(path))
         archive = _Archive(data)
-        colors = archive.texels("sh0")
-        raw = {"quats": archive.quats(), "scales": archive.values("scales", archive.texels("scales"))}
-        raw["sh0"] = archive.values("sh0", colors)
+        sh0, opacities = archive.colors()
+        raw = {
+            "quats": archive.quats(),
+            "scales": archive.values("scales", archive.texels("scales")[:, :3]),
+            "sh0": sh0,
+        }
         codes, codebooks = {}, {}
         if archive.sh_degree:
             codebooks["shN"], codes["shN"] = archive.palette()
@@ -383,25 +437,5 @@ def read_sog(path: str | os.PathLike[str]) -> CompressedScene:
             raw["shN"] = np.zeros((archive.count, 0), np.float32)
         antialiased = archive.meta.get("model") == "antialiased" or archive.meta.get("antialias") is True
         config = {"antialiased": True} if antialiased else {}
-        opacities = logits_of_bytes(colors[:, 3])
         scene = CompressedScene(archive.means(), opacities, codes, codebooks, raw, archive.sh_degree, config)
-        return replace(scene, stored_bytes=len(data))
-
-
-def describe_sog(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Facts about a file, see :class:`nsvq_lightning.io.formats.Format`.
-
-    Raises:
-        FormatError: The file is truncated, of another version, or not a ``.sog`` file.
-    """
-    path = Path(path)
-    with naming_file(path):
-        data = _archived(path)
-        archive = _Archive(data)
-    streams = {name: ("json" if name == META else "webp", size) for name, size in archive.sizes.items()}
-    total = sum(archive.sizes.values())
-    if path.suffix.lower() != ".json":
-        streams["zip"] = "zip", len(data) - total
-        total = len(data)
-    facts = {"format": "sog, version 2", "splats": archive.count, "sh_degree": archive.sh_degree}
-    return {**facts, "streams": streams, "bytes": total}
+        return replace(scene, stored_bytes=size)

@@ -50,7 +50,41 @@ def test_each_level_has_all_its_splats_in_the_boxes_of_its_leaves(tmp_path: Path
         assert len({int(np.abs(expected - row).sum(1).argmin()) for row in means}) == len(expected)
     nearest_in(arrays_of(read_scene(path)), arrays_of(levels[0]))
     facts = describe(path)
-    assert (facts["splats"], facts["format"], facts["bytes"]) == (1000, "streamed sog, 3 levels", size)
+    assert (facts["splats"], facts["format"]) == (1000, "lod-meta.json")
+    assert 0.5 * size < facts["bytes"] < size  # of the finest level
+
+
+def test_an_index_of_the_first_writers_and_what_surrounds_a_scene(tmp_path: Path) -> None:
+    path, scene, sky = tmp_path / "lod-meta.json", plain_scene(20, 1), plain_scene(8, 1, seed=1)
+    save(scene, path, coarser=[plain_scene(7, 1)])
+    save(sky, tmp_path / "env.sog")
+    index = json.loads(path.read_text())
+    for name in ("version", "count", "counts"):
+        del index[name]
+    finest = index["filenames"][index["tree"]["lods"]["0"]["file"]]
+    path.write_text(json.dumps(index | {"environment": None}))
+    nearest_in(arrays_of(read_scene(path)), arrays_of(scene))
+    path.write_text(json.dumps(index | {"environment": "env.sog"}))
+    read = read_scene(path)
+    assert read.stored_bytes == sum(
+        file.stat().st_size for file in (path, tmp_path / "env.sog", *(tmp_path / finest).parent.iterdir())
+    )
+    nearest_in(arrays_of(read.take(np.arange(20))), arrays_of(scene))
+    nearest_in(arrays_of(read.take(np.arange(20, 28))), arrays_of(sky))
+    path.write_text(json.dumps(index | {"environment": "../env.sog"}))
+    with pytest.raises(FormatError, match=r"is no FOLDER/meta\.json or \.sog beside it"):
+        read_scene(path)
+
+
+def test_a_new_scene_takes_the_place_of_one_that_names_its_folders_otherwise(tmp_path: Path) -> None:
+    path = tmp_path / "lod-meta.json"
+    save(plain_scene(20, 1), path)
+    index = json.loads(path.read_text())
+    (tmp_path / "mine").mkdir()
+    path.write_text(json.dumps(index | {"filenames": [f"./{name}" for name in index["filenames"]]}))
+    save(plain_scene(30, 1), path)
+    assert len(read_scene(path)) == 30
+    assert len(list(tmp_path.iterdir())) == 3  # the index, its one folder, and mine
 
 
 def test_levels_become_coarser(tmp_path: Path) -> None:
@@ -83,8 +117,8 @@ def test_a_failed_write_leaves_the_old_scene_and_a_new_one_its_own_folders(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda index: index["filenames"].__setitem__(0, "../meta.json"), "is no FOLDER/meta.json beside it"),
-        (lambda index: index["filenames"].__setitem__(0, "/etc/meta.json"), "is no FOLDER/meta.json beside it"),
+        (lambda index: index["filenames"].__setitem__(0, "../meta.json"), "is no FOLDER/meta.json or .sog beside it"),
+        (lambda index: index["filenames"].__setitem__(0, "/etc/meta.json"), "is no FOLDER/meta.json or .sog beside it"),
         (lambda index: index["filenames"].__setitem__(0, "gone/meta.json"), "incomplete: gone/meta.json is missing"),
         (lambda index: index.update(version=2), "version 2 of the format"),
         (lambda index: index["tree"]["lods"].clear(), "no leaf has splats of level 0"),
