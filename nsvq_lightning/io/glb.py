@@ -6,6 +6,7 @@ colours for each spherical harmonic. glTF has y up: our right, down, front turne
 """
 
 import json
+import logging
 import os
 import struct
 from collections.abc import Iterator
@@ -18,11 +19,14 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import atomic_write
 from nsvq_lightning.io.compressed import HALF_TURN, CompressedScene, joined, moved, rotated
-from nsvq_lightning.io.errors import FormatError, check_room, naming_file
-from nsvq_lightning.io.numbers import logits_of, opacity_of
+from nsvq_lightning.io.errors import FormatError, check_room, naming_file, wrong_start
+from nsvq_lightning.io.numbers import FLAT, logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.splats.conventions import SH_C0, sh_coefficients, unit
 
+log = logging.getLogger(__name__)
+
 EXTENSION = "KHR_gaussian_splatting"
+OPACITY = f"{EXTENSION}:OPACITY"
 
 
 def _harmonic(number: int) -> str:
@@ -54,7 +58,7 @@ def write_glb(path: str | os.PathLike[str], scene: CompressedScene) -> int:
         "COLOR_0": np.rint(255 * np.c_[linear, opacities]).astype(np.uint8),
         f"{EXTENSION}:ROTATION": unit(scene.values("quats"))[:, [1, 2, 3, 0]].astype(np.float32),
         f"{EXTENSION}:SCALE": np.exp(scene.values("scales")),
-        f"{EXTENSION}:OPACITY": opacities.astype(np.float32)[:, None],
+        OPACITY: opacities.astype(np.float32)[:, None],
         _harmonic(0): sh0,
     }
     shN = scene.values("shN")
@@ -105,6 +109,7 @@ def read_glb(path: str | os.PathLike[str]) -> CompressedScene:
     Raises:
         FormatError: The file is truncated, altered, no ``.glb`` file, or holds no Gaussian splats that are read:
             numbers in sparse accessors or other files, compressed ones, and nodes that stretch splats unevenly are not.
+            Lengths that are logarithms, and the names of drafts of the extension, are.
     """
     with naming_file(path):
         document, data = _parsed(Path(path).read_bytes())
@@ -115,13 +120,14 @@ def read_glb(path: str | os.PathLike[str]) -> CompressedScene:
                 count += len(parts[-1])
                 check_room("splats", count, len(data))  # primitives may share their numbers
             if not parts:
-                raise FormatError("no primitive has the extension KHR_gaussian_splatting", "give a file of splats")
+                used = ", ".join(map(str, document.get("extensionsUsed", ()))) or "none"
+                raise FormatError(f"no primitive has the extension {EXTENSION}; used are: {used}", "export splats so")
             scene = rotated(joined(parts), HALF_TURN)
             extras = document["asset"].get("extras")
         except (KeyError, TypeError, IndexError, AttributeError, ValueError, RecursionError) as error:
             if isinstance(error, FormatError):
                 raise
-            raise FormatError(f"damaged, or of a kind that is not read: {error!r}") from None
+            raise FormatError(f"of a kind that is not read, or altered: {error!r}", "save it as a plain .glb") from None
     antialiased = isinstance(extras, dict) and extras.get("antialiased") is True
     return replace(scene, config={"antialiased": True}) if antialiased else scene
 
@@ -132,7 +138,7 @@ _MOST_JSON = 1 << 26
 def _parsed(data: bytes) -> tuple[dict[str, Any], memoryview]:
     """JSON and binary chunk."""
     if len(data) < _HEAD.size + _CHUNK.size or data[:4] != b"glTF":
-        raise FormatError("not a .glb file: it does not start with a whole header 'glTF'")
+        raise wrong_start(".glb", data, b"glTF")
     _, version, total = _HEAD.unpack_from(data)
     length, kind = _CHUNK.unpack_from(data, _HEAD.size)
     start = _HEAD.size + _CHUNK.size
@@ -179,29 +185,49 @@ def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
 
 def _splats(document: dict[str, Any], data: memoryview, primitive: dict[str, Any]) -> CompressedScene:
     """The splats of a primitive, in the axes of the file."""
-    names = primitive["attributes"]
-    if inner := primitive["extensions"][EXTENSION].get("extensions"):
+    about = primitive["extensions"][EXTENSION]
+    if inner := about.get("extensions"):
         raise FormatError(f"splats are compressed by {', '.join(inner)}, which is not read", "save them without it")
+    if about.get("colorSpace") == "lin_rec709_display":
+        log.warning("colorSpace lin_rec709_display: colours are linear light and are shown as they are, too dark")
+    given = primitive["attributes"]
+    names = {f"{EXTENSION}:{name[1:]}": number for name, number in given.items() if name.startswith("_")} | given
+    if len(names) > len(given):
+        log.warning("attributes have the names of a draft of %s, such as _ROTATION", EXTENSION)
 
     def values(name: str) -> NDArray[np.float32]:
+        if name not in names:
+            raise FormatError(f"splats without the attribute {name}")
         return _accessor(document, data, names[name])
 
-    degree = max(degree for degree in range(4) if _harmonic((degree + 1) ** 2 - 1) in names)
+    degree = max((degree for degree in range(4) if _harmonic((degree + 1) ** 2 - 1) in names), default=0)
     higher = [values(_harmonic(number + 1)) for number in range(sh_coefficients(degree))]
     means = values("POSITION")
     raw = {
         "quats": values(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
-        "scales": np.log(values(f"{EXTENSION}:SCALE").clip(np.finfo(np.float32).tiny)),
-        "sh0": values(_harmonic(0)),
+        "scales": _logs_of_scale(values(f"{EXTENSION}:SCALE")),
+        # In drafts, colours and opacities were those of the points.
+        "sh0": values(_harmonic(0)) if _harmonic(0) in names else (values("COLOR_0")[:, :3] - 0.5) / np.float32(SH_C0),
         "shN": np.concatenate([np.zeros((len(means), 0), np.float32), *higher], axis=1),
     }
-    return CompressedScene(means, logits_of(values(f"{EXTENSION}:OPACITY")[:, 0]), raw=raw, sh_degree=degree)
+    opacities = values(OPACITY if OPACITY in names else "COLOR_0")[:, -1]
+    return CompressedScene(means, logits_of(opacities), raw=raw, sh_degree=degree)
+
+
+def _logs_of_scale(scale: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Logarithms ``[N, 3]`` of what SCALE holds: lengths, or, until the middle of 2026, their logarithms."""
+    if not (scale < 0).any():
+        return logs_of_lengths(scale)
+    log.warning("SCALE has negative numbers: taken as logarithms of lengths, which it was in drafts")
+    return scale.clip(FLAT)
 
 
 def _accessor(document: dict[str, Any], data: memoryview, number: int) -> NDArray[np.float32]:
     """Rows ``[N, D]`` of an accessor."""
     accessor = document["accessors"][number]
     view = document["bufferViews"][accessor["bufferView"]]
+    if packed := view.get("extensions"):
+        raise FormatError(f"numbers are compressed by {', '.join(packed)}, which is not read", "save them without it")
     if "sparse" in accessor or view.get("buffer", 0) or "uri" in document["buffers"][0]:
         raise FormatError("numbers in sparse accessors or in other files are not read", "save it as a plain .glb")
     dtype, width, count = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[accessor["type"]], accessor["count"]
@@ -213,6 +239,6 @@ def _accessor(document: dict[str, Any], data: memoryview, number: int) -> NDArra
     if count and start + (count - 1) * stride + row > len(data):
         raise FormatError(f"truncated: accessor {number} ends beyond the file")
     rows = np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize)).astype(np.float32)
-    if dtype.kind != "f":  # normalized
+    if dtype.kind != "f" and accessor.get("normalized"):
         rows = np.maximum(rows / np.float32(np.iinfo(dtype).max), np.float32(-1))
     return rows

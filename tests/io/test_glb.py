@@ -123,11 +123,97 @@ def test_nodes_put_splats_in_their_place_and_small_numbers_are_read(tmp_path: Pa
         (lambda d: d["accessors"][2].update(count=1 << 40), "accessor 2 ends beyond the file"),
         (lambda d: d["meshes"][0]["primitives"][0]["extensions"][NAME].update(extensions={"spz": {}}), "compressed by"),
         (lambda d: d["scenes"][0].update(nodes=[0] * 9000), "a node is in two others"),
+        (
+            lambda d: d["bufferViews"][3].update(extensions={"EXT_meshopt_compression": {}}),
+            "by EXT_meshopt_compression",
+        ),
+        (
+            lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(f"{NAME}:SCALE"),
+            f"without the attribute {NAME}:SCALE",
+        ),
     ],
 )
 def test_what_is_not_read_is_said(tmp_path: Path, change: Any, message: str) -> None:
     save(plain_scene(20, 0), tmp_path / "x.glb")
     document, data = parts(tmp_path / "x.glb")
     change(document)
-    with pytest.raises(FormatError, match=message):
+    with pytest.raises(FormatError, match=message) as caught:
         read_scene(write(tmp_path / "y.glb", document, data))
+    assert ("copy the file again" in str(caught.value)) == ("ends beyond the file" in message)
+
+
+def renamed(document: dict[str, Any], **names: str) -> dict[str, int]:
+    """The attributes of the primitive, some under other names."""
+    primitive = document["meshes"][0]["primitives"][0]
+    old = primitive["attributes"]
+    primitive["attributes"] = {names.get(name.split(":")[-1], name): number for name, number in old.items()}
+    return primitive["attributes"]
+
+
+def replaced(document: dict[str, Any], data: bytes, name: str, values: NDArray[Any], **accessor: Any) -> bytes:
+    """The numbers of the file, with others for an attribute."""
+    number = document["meshes"][0]["primitives"][0]["attributes"][name]
+    view = document["bufferViews"][document["accessors"][number]["bufferView"]]
+    document["accessors"][number] |= accessor
+    view["byteOffset"], view["byteLength"] = len(data), values.nbytes
+    document["buffers"][0]["byteLength"] = len(data) + values.nbytes
+    return data + values.tobytes()
+
+
+def test_lengths_that_are_logarithms_are_known_by_their_sign(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    scene = plain_scene(20, 0)  # some logarithms are above 0
+    save(scene, tmp_path / "x.glb")
+    document, data = parts(tmp_path / "x.glb")
+    logs = scene.values("scales").copy()
+    logs[3, 2] = -np.inf
+    back = read_scene(write(tmp_path / "y.glb", document, replaced(document, data, f"{NAME}:SCALE", logs)))
+    logs[3, 2] = np.log(np.finfo(np.float32).tiny)
+    np.testing.assert_allclose(back.values("scales"), logs, rtol=1e-6)
+    assert "taken as logarithms" in caplog.text
+
+
+def test_names_of_drafts_are_known(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    save(plain_scene(20, 1), tmp_path / "x.glb")
+    document, data = parts(tmp_path / "x.glb")
+    draft = {
+        "ROTATION": "_ROTATION",
+        "SCALE": "_SCALE",
+        "OPACITY": "_OPACITY",
+        "SH_DEGREE_1_COEF_0": "_SH_DEGREE_1_COEF_0",
+    }
+    renamed(document, **draft)
+    whole, back = (
+        arrays_of(read_scene(path)) for path in (tmp_path / "x.glb", write(tmp_path / "y.glb", document, data))
+    )
+    for name, values in vars(whole).items():
+        np.testing.assert_array_equal(getattr(back, name), values, err_msg=name)
+    assert "draft" in caplog.text
+
+
+def test_drafts_had_colours_and_opacities_in_those_of_the_points(tmp_path: Path) -> None:
+    save(plain_scene(20, 0), tmp_path / "x.glb")
+    document, data = parts(tmp_path / "x.glb")
+    names = renamed(document, ROTATION="_ROTATION", SCALE="_SCALE")
+    del names[f"{NAME}:OPACITY"], names[f"{NAME}:SH_DEGREE_0_COEF_0"]
+    colors = np.random.default_rng(1).integers(1, 255, (20, 4), np.uint8)
+    back = read_scene(write(tmp_path / "y.glb", document, replaced(document, data, "COLOR_0", colors)))
+    np.testing.assert_allclose(0.5 + 0.28209479 * back.values("sh0")[:, 0], colors[:, :3] / 255, atol=1e-6)
+    np.testing.assert_allclose(sigmoid(back.opacities), colors[:, 3] / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize(("normalized", "unit"), [(True, 127), (False, 1)])
+def test_whole_numbers_are_fractions_only_where_that_is_said(tmp_path: Path, normalized: bool, unit: int) -> None:
+    save(plain_scene(20, 0), tmp_path / "x.glb")
+    document, data = parts(tmp_path / "x.glb")
+    lengths = np.random.default_rng(1).integers(1, 127, (20, 3)).astype(np.int8)
+    data = replaced(document, data, f"{NAME}:SCALE", lengths, componentType=5120, normalized=normalized)
+    back = read_scene(write(tmp_path / "y.glb", document, data))
+    np.testing.assert_allclose(np.exp(back.values("scales")), lengths / unit, rtol=1e-5)
+
+
+def test_linear_light_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    save(plain_scene(20, 0), tmp_path / "x.glb")
+    document, data = parts(tmp_path / "x.glb")
+    document["meshes"][0]["primitives"][0]["extensions"][NAME]["colorSpace"] = "lin_rec709_display"
+    read_scene(write(tmp_path / "y.glb", document, data))
+    assert "lin_rec709_display: colours are linear light" in caplog.text
