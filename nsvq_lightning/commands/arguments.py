@@ -398,23 +398,30 @@ def photos_of(path: Path) -> Path | None:
 def cameras_of(path: Path, root: Path | None) -> "dict[str, Camera]":
     """Cameras by name of the photos that a scene was trained on; where these are gone, what its run has recorded.
 
+    A run of INRIA's trainer has recorded them in ``cameras.json`` beside the file or one or two folders above it.
+
     Args:
         path: A scene file, or the folder of a run; without a run, there are none.
         root: Scene folder whose cameras they are instead.
 
     Raises:
         SceneError: The folder is not a scene.
-        ValueError: ``viewer.html`` of the run is damaged.
+        ValueError: ``viewer.html`` or ``cameras.json`` of the run is damaged.
     """
     from nsvq_lightning.data.scene import load_scene
+    from nsvq_lightning.rendering.camera_paths import CAMERAS, read_cameras
     from nsvq_lightning.report.viewer import page_cameras
 
     root = root or photos_of(path)
     if root is not None:
         scene = load_scene(root)
         return dict(zip(scene.names, scene.cameras, strict=True))
-    page = (path if path.is_dir() else path.parent) / "viewer.html"
-    return page_cameras(page) if page.is_file() else {}
+    folder = (path if path.is_dir() else path.parent).resolve()
+    if (folder / "viewer.html").is_file():
+        return page_cameras(folder / "viewer.html")
+    lists = (place / CAMERAS for place in [folder, *folder.parents][:3])
+    found = next((each for each in lists if each.is_file()), None)
+    return read_cameras(found) if found else {}
 
 
 def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -> "tuple[list[Camera], Scene | None]":

@@ -1,8 +1,9 @@
-"""Cameras along a path: through given ones, around what they look at, or from nerfstudio's JSON."""
+"""Cameras along a path: through given ones, around what they look at; and those that JSON files list."""
 
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import RotationSpline
+from torch import Tensor
 
 from nsvq_lightning.rendering.camera import Camera, camera_of
+from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.rendering.poses import looked_at, poses, up_of, view_from, view_towards
 
 
@@ -137,15 +140,63 @@ def _entry_camera(entry: Mapping[str, Any], width: int, height: int) -> Camera:
     if np.abs(pose[3, :3]).max() > np.abs(pose[:3, 3]).max():
         pose = pose.T
     rotation, field = pose[:3, :3], float(entry["fov"])
-    if not (np.isfinite(pose).all() and np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6)):
+    if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
         raise ValueError("a pose is not a rigid matrix of 4x4")
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise ValueError("a pose is not a rotation and a position")
     if not 0 < field < 180:
         raise ValueError(f"a field of view is {field} degrees")
     focal = 0.5 * height / math.tan(math.radians(field) / 2)
     rotation = rotation * [1, -1, -1]  # from y up, looking along -z, to y down, looking along z
-    return camera_of(view_from(rotation, pose[:3, 3]), (focal, focal, width / 2, height / 2), width, height)
+    return camera_of(_rigid_view(rotation, pose[:3, 3]), (focal, focal, width / 2, height / 2), width, height)
+
+
+# File beside a scene of INRIA's trainer, or two folders above it.
+CAMERAS = "cameras.json"
+_MOST_PIXELS = 1 << 16
+
+
+def read_cameras(path: Path) -> dict[str, Camera]:
+    """The cameras of photos by name, as INRIA's trainer lists them; their principal points are in the middle.
+
+    Args:
+        path: JSON, a list of ``img_name``, ``width``, ``height``, ``fx``, ``fy`` (pixels), ``rotation`` (from the
+            camera to the world, three rows) and ``position`` (the camera's, scene units), in our axes.
+
+    Raises:
+        ValueError: It is no such list.
+        OSError: It cannot be read.
+    """
+    cameras: dict[str, Camera] = {}
+    try:
+        for entry in json.loads(path.read_text(encoding="utf-8")):
+            rotation, position = (np.array(entry[key], np.float64) for key in ("rotation", "position"))
+            width, height = int(entry["width"]), int(entry["height"])
+            if max(width, height) > _MOST_PIXELS:
+                raise ValueError(f"a picture of {width}x{height}")
+            lens = (entry["fx"], entry["fy"], width / 2, height / 2)
+            name = str(entry["img_name"])
+            if name in cameras:  # the names of photos in several folders, without these
+                name = f"{name} ({entry['id']})"
+            cameras[name] = camera_of(_rigid_view(rotation, position), lens, width, height)
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        advice = "move it away, or name the photos with --data.root"
+        raise ValueError(f"{path} is no list of cameras as INRIA's trainer writes it ({reason}): {advice}") from None
+    if not cameras:
+        return {}
+    near = Frame.around(poses(list(cameras.values()))[0]).near
+    return {name: replace(camera, near=near) for name, camera in cameras.items()}
+
+
+# Coordinates that float32 holds with room to spare.
+_FAR = 1e30
+
+
+def _rigid_view(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:
+    """:func:`~nsvq_lightning.rendering.poses.view_from` of numbers that may be anything."""
+    rigid = rotation.shape == (3, 3) and position.shape == (3,) and (np.abs(position) < _FAR).all()
+    if not rigid or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise ValueError("a pose is not a rotation and a position")
+    return view_from(rotation, position)
 
 
 def _arc(angles: NDArray[np.float64]) -> tuple[float, float]:

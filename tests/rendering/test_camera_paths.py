@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.camera_paths import orbit, read_camera_path, reframed, smooth_path
+from nsvq_lightning.rendering.camera_paths import orbit, read_camera_path, read_cameras, reframed, smooth_path
 
 
 def camera(position: Any, rotation: Rotation | None = None, focal: float = 100.0) -> Camera:
@@ -189,3 +189,55 @@ def test_poses_that_cannot_be_are_refused(tmp_path: Path, change: dict[str, floa
     entry = {"camera_to_world": matrix.ravel().tolist(), "fov": change.get("fov", 50.0)}
     with pytest.raises(ValueError, match=words):
         read_camera_path(_written(tmp_path / "a.json", [entry]))
+
+
+def _inria(seen: Camera, name: str, **change: Any) -> dict[str, Any]:
+    """Oracle: rotation and position of the inverse of the view, as the trainer writes them."""
+    pose = np.linalg.inv(seen.viewmat.double().numpy())
+    lens = {"width": seen.width, "height": seen.height, "fx": 100.0, "fy": 90.0}
+    rotation = [row.tolist() for row in pose[:3, :3]]
+    return {"id": 7, "img_name": name, **lens, "position": pose[:3, 3].tolist(), "rotation": rotation} | change
+
+
+def test_cameras_of_inrias_trainer(tmp_path: Path) -> None:
+    given = around([0.0, 0.7, 1.5])
+    entries = [_inria(seen, name) for seen, name in zip(given, ("a", "b", "a"), strict=True)]
+    (tmp_path / "cameras.json").write_text(json.dumps(entries))
+    cameras = read_cameras(tmp_path / "cameras.json")
+    assert list(cameras) == ["a", "b", "a (7)"]
+    for found, seen in zip(cameras.values(), given, strict=True):
+        np.testing.assert_allclose(found.viewmat, seen.viewmat, atol=1e-5)
+        assert found.intrinsics == (100, 90, seen.width / 2, seen.height / 2)
+        assert (found.width, found.height) == (seen.width, seen.height)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, "not a rotation and a position"),
+        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "not a rotation and a position"),
+        ({"rotation": [[1, 0], [0, 1]]}, "not a rotation and a position"),
+        ({"position": [0, float("nan"), 0]}, "not a rotation and a position"),
+        ({"position": [0, 1e300, 0]}, "not a rotation and a position"),
+        ({"position": [0, "x", 0]}, "could not convert"),
+        ({"width": 10**9}, "a picture of 1000000000x"),
+        ({"height": 0}, "at least one pixel"),
+        ({"fx": 0}, "positive, finite focal lengths"),
+        ({"fx": None}, "float"),
+    ],
+)
+def test_other_lists_of_cameras_are_refused_in_one_line(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps([_inria(around([0.0])[0], "a", **change)]))
+    with pytest.raises(
+        ValueError, match=rf"cameras\.json is no list of cameras .*{words}.*: move it away, or"
+    ) as caught:
+        read_cameras(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["{", "7", '{"cameras": 1}', "[1]", "[{}]", "[[]]", 9000 * "[", "\ud800"])
+def test_what_is_no_list_of_cameras_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "cameras.json").write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(ValueError, match=r"cameras\.json is no list of cameras"):
+        read_cameras(tmp_path / "cameras.json")
