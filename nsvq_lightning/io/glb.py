@@ -219,7 +219,8 @@ def _logs_of_scale(scale: NDArray[np.float32]) -> NDArray[np.float32]:
     if not (scale < 0).any():
         return logs_of_lengths(scale)
     log.warning("SCALE has negative numbers: taken as logarithms of lengths, which it was in drafts")
-    return scale.clip(FLAT)
+    scale[np.isneginf(scale)] = FLAT
+    return scale
 
 
 def _accessor(document: dict[str, Any], data: memoryview, number: int) -> NDArray[np.float32]:

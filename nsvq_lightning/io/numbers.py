@@ -36,13 +36,16 @@ def logits_of_bytes(levels: NDArray[np.uint8]) -> NDArray[np.float32]:
     return logits_of(np.arange(256) / 255)[levels]
 
 
-# Logarithm of an axis length of 0, which discs have: that of the smallest number of float32 with full precision.
-FLAT = float(np.log(np.finfo(np.float32).tiny))
+# Logarithm that stands for that of an axis length of 0, which discs have: too thin to show, and not beyond any format's
+# range by more than it must be.
+FLAT = -20.0
 
 
 def logs_of_lengths(lengths: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Logarithms of axis lengths of any shape, :data:`FLAT` or more; NaN and infinite lengths stay."""
-    return np.log(lengths.clip(np.finfo(np.float32).tiny))
+    """Logarithms of axis lengths of any shape, :data:`FLAT` where there is no length; NaN and infinite ones stay."""
+    logs: NDArray[np.float32] = np.log(lengths.clip(np.finfo(np.float32).tiny))
+    logs[lengths <= 0] = FLAT
+    return logs
 
 
 logger = logging.getLogger(__name__)

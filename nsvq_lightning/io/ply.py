@@ -116,8 +116,8 @@ def _parsed(file: BinaryIO) -> PlyHeader:
     return replace(elements.pop("vertex"), antialiased=antialiased, others=elements)
 
 
-# What a point cloud editor (CloudCompare) puts before the names that it does not know.
-_PREFIX = "scalar_"
+# What a point cloud editor (CloudCompare), and a converter for it, put before names.
+_PREFIXES = "^(scalar_|scal_)+"
 
 
 def _elements(lines: list[list[str]], encoding: str, offset: int, file: BinaryIO) -> dict[str, PlyHeader]:
@@ -133,7 +133,7 @@ def _elements(lines: list[list[str]], encoding: str, offset: int, file: BinaryIO
             case ["property", "list", length, kind, name] if fields and {length, kind} <= _TYPES.keys():
                 fields[-1][2].append((name, order + _TYPES[kind], order + _TYPES[length]))
             case ["property", kind, name] if fields and kind in _TYPES:
-                fields[-1][2].append((name.removeprefix(_PREFIX), order + _TYPES[kind]))
+                fields[-1][2].append((re.sub(_PREFIXES, "", name), order + _TYPES[kind]))
             case _:
                 raise FormatError(f"bad header line {' '.join(line)[:80]!r}")
     found: dict[str, PlyHeader] = {}
@@ -215,7 +215,7 @@ def _needed(header: PlyHeader, sh_degree: int) -> dict[str, list[str]]:
 def _coefficients(colors: NDArray[np.float32], is_float: bool) -> NDArray[np.float32]:
     """SH coefficients of colours: floats to 1, or whole numbers to 255 or 65535, as the numbers themselves tell."""
     full = 255 if colors.max(initial=0) <= 255 else 65535
-    if is_float and np.median(colors) <= 1:
+    if is_float and len(colors) and np.quantile(colors, 0.9) <= 1:
         full = 1
     return ((colors / full - 0.5) / SH_C0).astype(np.float32)
 
@@ -262,17 +262,18 @@ def read_ply(path: str | os.PathLike[str]) -> CompressedScene:
 def _read_plain(path: str | os.PathLike[str], header: PlyHeader, sh_degree: int) -> dict[str, NDArray[np.float32]]:
     """Rows ``[N, D]`` of each attribute."""
     columns = _needed(header, sh_degree)
-    raw = {name: np.empty((header.count, len(names)), np.float32) for name, names in columns.items()}
+    # A third scale that is not there stays flat.
+    raw = {name: np.full((header.count, dim), FLAT, np.float32) for name, dim in attribute_dims(sh_degree).items()}
     ends = np.cumsum([len(names) for names in columns.values()])
     start = 0
     for table in read_ply_columns(path, header, [name for names in columns.values() for name in names]):
         for name, part in zip(raw, np.split(table, ends[:-1], axis=1), strict=True):
-            raw[name][start : start + len(table)] = _by_coefficient(part) if name == "shN" else part
+            rows = _by_coefficient(part) if name == "shN" else part
+            raw[name][start : start + len(table), : rows.shape[1]] = rows
         start += len(table)
     if columns["sh0"] == _RGB:
         raw["sh0"] = _coefficients(raw["sh0"], header.dtype["red"].kind == "f")
-    thickness = np.full((header.count, 3 - raw["scales"].shape[1]), FLAT, np.float32)
-    raw["scales"] = np.concatenate([raw["scales"], thickness], axis=1).clip(FLAT)
+    raw["scales"][np.isneginf(raw["scales"])] = FLAT
     # Writers that store opacity as a byte make 0 and 255 infinite logits.
     return raw | {"opacities": finite_logits(raw["opacities"])}
 

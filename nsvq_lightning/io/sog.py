@@ -211,10 +211,10 @@ class _Archive:
 
     def _numbers(self, attribute: str, name: str, count: range, largest: float) -> NDArray[np.float64]:
         values = self._entry(attribute).get(name)
-        values = values if isinstance(values, list) else [values]
+        values = [np.nan if value is None else value for value in (values if isinstance(values, list) else [values])]
         if len(values) not in count:
             raise FormatError(f"damaged: {name!r} in {META} must be a list of {count[0]} to {count[-1]} numbers")
-        if not all(type(value) in (int, float) and abs(value) <= largest for value in values):
+        if not all(type(value) in (int, float) and not abs(value) > largest for value in values):
             raise FormatError(f"damaged: {name!r} in {META} must hold numbers of at most {largest:.4g}")
         return np.array(values, np.float64)
 
@@ -258,16 +258,16 @@ class _Archive:
 
     def _levels(self, attribute: str) -> NDArray[np.float64]:
         """The codebook of an attribute; levels that are null, as older writers left NaN, in line with the others."""
-        codebook = self._entry(attribute).get("codebook")
-        if not isinstance(codebook, list) or None not in codebook:
-            return self._numbers(attribute, "codebook", range(1, _LEVELS + 1), _LARGEST)
+        levels = self._numbers(attribute, "codebook", range(1, _LEVELS + 1), _LARGEST)
+        known = np.flatnonzero(np.isfinite(levels))
+        if len(known) == len(levels):
+            return levels
+        if len(known) < 2:
+            raise FormatError(f"damaged: the 'codebook' of {attribute} holds no numbers")
         from scipy.interpolate import make_interp_spline  # slow to import
 
-        log.warning("%d levels of %s are null: taken in line with those beside", codebook.count(None), attribute)
-        known = np.flatnonzero([level is not None for level in codebook])
-        self.meta[attribute]["codebook"] = [codebook[number] for number in known]
-        levels = self._numbers(attribute, "codebook", range(2, _LEVELS), _LARGEST)
-        return np.asarray(make_interp_spline(known, levels, k=1)(np.arange(len(codebook))))
+        log.warning("%d levels of %s are null: taken in line with those beside", len(levels) - len(known), attribute)
+        return np.asarray(make_interp_spline(known, levels[known], k=1)(np.arange(len(levels))))
 
     def colors(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Constant coefficients ``[N, 3]`` and opacity logits ``[N]``."""
@@ -401,18 +401,20 @@ def _picture(texels: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.ui
     return picture.reshape(*shape, 4)
 
 
+_PICTURES = (".webp", ".png")
+
+
 def _archived(path: Path) -> tuple[bytes, int]:
     """The zip archive and its size; of a folder, whose ``meta.json`` is given, one with the pictures in it."""
     if path.suffix.lower() != ".json":
         return path.read_bytes(), path.stat().st_size
     buffer, text = io.BytesIO(), path.read_text(encoding="utf-8", errors="replace")
+    pictures = [each for each in path.parent.glob("*.*") if each.suffix.lower() in _PICTURES and each.name in text]
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.write(path, META)
-        for picture in sorted(path.parent.iterdir()):
-            if picture.suffix.lower() in (".webp", ".png") and picture.name in text:
-                archive.write(picture, picture.name)
-        size = sum(entry.file_size for entry in archive.infolist())
-    return buffer.getvalue(), size
+        for picture in pictures:
+            archive.write(picture, picture.name)
+    return buffer.getvalue(), sum(file.stat().st_size for file in (path, *pictures))
 
 
 def read_sog(path: str | os.PathLike[str]) -> CompressedScene:

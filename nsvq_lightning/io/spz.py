@@ -58,7 +58,7 @@ class SpzHeader:
     Attributes:
         version: 1 to 4.
         count: Number of splats N.
-        sh_degree: Degree of the spherical harmonics, 0 to 3.
+        sh_degree: Degree of the spherical harmonics, 0 to 4, of which 3 are read.
         fraction_bits: Fractional bits of the positions.
         flags: :data:`ANTIALIASED`, and 2 where extensions follow.
         axes: Where x, y and z point: right or left, down or up, front or back, by their first letters; empty if the
@@ -76,7 +76,7 @@ class SpzHeader:
     def sizes(self) -> dict[str, int]:
         """Bytes per splat of each array, in file order."""
         means, quats = (6 if self.version == 1 else 9), (4 if self.version >= 3 else 3)
-        sh = 3 * conventions.sh_coefficients(self.sh_degree)
+        sh = 3 * ((self.sh_degree + 1) ** 2 - 1)
         return {"means": means, "opacities": 1, "sh0": 3, "scales": 3, "quats": quats, "shN": sh}
 
     @property
@@ -201,7 +201,10 @@ def _with_axes(header: SpzHeader, extensions: bytes) -> SpzHeader:
         kind, length, system = _EXTENSION.unpack_from(extensions, start)
         if (kind, length) == (_AXES, 4):
             if system >= len(_SYSTEMS):
-                raise FormatError(f"damaged, or newer than this release: coordinate system {system}, not 0 to 16")
+                raise FormatError(
+                    f"damaged, or newer than this release: coordinate system {system}, not 0 to 16",
+                    "update nsvq-lightning",
+                )
             return replace(header, axes=_SYSTEMS[system])
         start += 8 + length
     return header
@@ -246,8 +249,8 @@ def _parse(start: bytes, file_bytes: int) -> SpzHeader:
     _, version, count, sh_degree, fraction_bits, flags, _ = _HEADER.unpack(start)
     if not 1 <= version <= 4:
         raise FormatError(f"version {version} of the format; this release reads 1 to 4", "save it as version 3 or .ply")
-    if sh_degree > 3:
-        raise FormatError(f"damaged, or of a degree that this release does not read: SH degree {sh_degree}, not 0 to 3")
+    if sh_degree > 4:
+        raise FormatError(f"damaged: SH degree {sh_degree}, not 0 to 4")
     if fraction_bits > MOST_FRACTION:
         raise FormatError(f"damaged: {fraction_bits} fractional bits, more than {MOST_FRACTION}")
     check_room("splats", count, file_bytes)
@@ -390,11 +393,14 @@ def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
     if not header.axes:
         advice = "If it is upside down: nsvq convert --up minus-y --up-from 0 1 0"
         logger.info("%s: the file does not say where its axes point; taken as right, down, front. %s", path, advice)
+    degree = min(header.sh_degree, 3)
+    if header.sh_degree > degree:
+        logger.warning("%s: of SH degree %d, degrees up to %d are read", path, header.sh_degree, degree)
     axes = header.axes or DEFAULT_AXES.upper()
     turn = axes[1] in "FB"
     if turn:  # z is up or down: signs first, then a quarter turn, as Niantic's library does it, which writes such files
         axes = axes[0] + axes[2] + {"F": "B", "B": "F"}[axes[1]]
-    xyz, quats, harmonics = _signs(axes, header.sh_degree)
+    xyz, quats, harmonics = _signs(axes, degree)
     scene = CompressedScene(
         means=(_unpacked_means(header, arrays["means"]) * xyz).astype(np.float32),
         opacities=logits_of_bytes(arrays["opacities"][:, 0]),
@@ -402,9 +408,9 @@ def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
             "quats": _unpacked_quats(header, arrays["quats"]) * quats,
             "scales": (arrays["scales"] / 16 - 10).astype(np.float32),
             "sh0": ((arrays["sh0"] / 255 - 0.5) / _COLOR).astype(np.float32),
-            "shN": ((arrays["shN"].astype(np.float32) - 128) / 128 * harmonics).astype(np.float32),
+            "shN": ((arrays["shN"][:, : len(harmonics)].astype(np.float32) - 128) / 128 * harmonics).astype(np.float32),
         },
-        sh_degree=header.sh_degree,
+        sh_degree=degree,
         config={"antialiased": True} if header.flags & ANTIALIASED else {},
     )
     return rotated(scene, UP_AXES["z"]) if turn else scene

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import struct
 from pathlib import Path
 from types import ModuleType
@@ -41,7 +42,7 @@ def test_extensions_that_say_nothing_of_the_axes_are_passed_over(tmp_path: Path)
         (4, struct.pack("<I", 5), "version 5 of the format"),
         (4, struct.pack("<I", 3), "version 3 .* without gzip"),
         (8, struct.pack("<I", 1 << 31), "2147483648 splats cannot be in"),
-        (12, bytes([4]), "SH degree 4"),
+        (12, bytes([5]), "SH degree 5"),
         (13, bytes([31]), "31 fractional bits"),
         (15, bytes([5]), "5 streams where there must be 6"),
         (16, struct.pack("<I", 16), "a table of 6 streams at 16"),
@@ -109,3 +110,15 @@ def test_without_zstandard_the_error_says_what_to_install(monkeypatch: pytest.Mo
     monkeypatch.setattr("nsvq_lightning.io.spz.import_module", missing)
     with pytest.raises(FormatError, match=r"needs Zstandard.* pip install 'nsvq-lightning\[spz\]'"):
         zstd_compress(DATA)
+
+
+@pytest.mark.parametrize("degree", [3, 4])
+def test_of_degree_4_the_first_three_are_read(tmp_path: Path, degree: int, caplog: pytest.LogCaptureFixture) -> None:
+    """Oracle: 128 + 128 x, coefficient by coefficient."""
+    coefficients = (degree + 1) ** 2 - 1
+    levels = np.random.default_rng(1).integers(0, 256, (5, coefficients, 3), np.uint8)
+    head = struct.pack("<4sIIBBBB", b"NGSP", 3, 5, degree, 12, 0, 0)
+    (tmp_path / "x.spz").write_bytes(gzip.compress(head + bytes(5 * 20) + levels.tobytes()))
+    read = read_scene(tmp_path / "x.spz")
+    np.testing.assert_allclose(read.values("shN"), (levels[:, :15] - 128.0) / 128)
+    assert ("of SH degree 4, degrees up to 3 are read" in caplog.text) == (degree == 4)
