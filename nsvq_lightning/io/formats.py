@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from nsvq_lightning.io import glb, lod, ply, sog, splat, spz, usda
 from nsvq_lightning.io.compressed import CompressedScene, in_morton_order
 from nsvq_lightning.io.errors import naming_file
@@ -65,7 +67,7 @@ def read_scene(path: str | os.PathLike[str]) -> CompressedScene:
     scene = format_of(path).read(path)
     with naming_file(path):
         kept = scene.finite()
-    if unturned := int(kept.spread("quats", lambda rows, _: ~rows.any(1)).sum()):
+    if unturned := len(kept) - np.count_nonzero(kept.values("quats").any(axis=1)):
         logger.warning("%s: %d of %d splats have the rotation 0 0 0 0: not turned", path, unturned, len(kept))
     return replace(kept, stored_bytes=scene.stored_bytes or path.stat().st_size)
 

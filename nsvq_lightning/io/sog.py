@@ -181,18 +181,16 @@ class _Archive:
         self.sh_degree = self._integer(self._entry("shN"), "bands", 0, 3) if "shN" in self.meta else 0
 
     def _bytes(self, name: str, most: int) -> bytes:
+        entry = self._zip.NameToInfo.get(name)
+        if entry is None:
+            raise FormatError(f"incomplete: there is no {name}", "copy all of its files again")
+        if entry.file_size > most:
+            raise FormatError(f"damaged: {name} cannot have {entry.file_size} bytes")
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # whose length can be limited
+            raise FormatError(f"{name} is compressed by method {entry.compress_type} of zip, not 0 (none) or 8")
         try:
-            entry = self._zip.getinfo(name)
-            if entry.file_size > most:
-                raise FormatError(f"damaged: {name} cannot have {entry.file_size} bytes")
-            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # whose length can be limited
-                raise FormatError(f"{name} is compressed by method {entry.compress_type} of zip, not 0 (none) or 8")
             with self._zip.open(entry) as file:
                 return file.read(entry.file_size)  # not read(name), which unpacks all there is, whatever its length
-        except KeyError:
-            raise FormatError(f"not a whole .sog file: the archive has no {name}") from None
-        except FormatError:
-            raise
         except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, ValueError, struct.error) as error:
             raise FormatError(f"damaged: {name} cannot be unpacked ({error})") from None
 

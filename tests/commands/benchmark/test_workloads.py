@@ -9,7 +9,7 @@ from nsvq_lightning import save
 from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.commands.benchmark.workloads import relative_l2, synthetic_workload, workloads
 from nsvq_lightning.data.scene import load_scene
-from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io import CompressedScene, write_ply
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats
 
@@ -33,7 +33,7 @@ def test_crop_shows_the_middle_of_the_view() -> None:
     assert torch.equal(small.image_gradient, workload.image_gradient[130:170, 168:232])
 
 
-def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path) -> None:
     source = RawSplats(*(tensor[:500].clone() for tensor in synthetic_workload("A20k").splats))
     source.means.add_(torch.tensor([10.0, -3.0, 7.0]))
     path = tmp_path / "scene.ply"
@@ -44,11 +44,11 @@ def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path, monk
     assert float((render(whole.splats, whole.camera).radii > 0).float().mean()) > 0.7
     # Our own writer drops such rows; files of others have them.
     source.opacities[3] = torch.nan
-    read = "nsvq_lightning.commands.benchmark.workloads.read_scene"
-    monkeypatch.setattr(read, lambda _: CompressedScene.from_splats(source))
+    write_ply(path, CompressedScene.from_splats(source))
     assert len(workloads(scope)[0].splats.means) == 499
     source.opacities.fill_(torch.nan)
-    with pytest.raises(ValueError, match="no splat"):
+    write_ply(path, CompressedScene.from_splats(source))
+    with pytest.raises(ValueError, match="no finite splat"):
         workloads(scope)
 
 
