@@ -6,6 +6,7 @@ Examples:
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 
@@ -52,10 +53,12 @@ def run(options: argparse.Namespace) -> int:
         part = whole.take(block.contains(whole.means + np.array(whole.origin))).in_use()
         sys.stdout.write(f"{folder}: {len(part):,} of {len(whole):,} splats are in its core\n")
         parts.append(part)
-    scene = joined(parts)
+    photos = load_scene(blocks[0].scene)
+    # Parts have the coordinates of the whole's files, whose origin only the whole knows.
+    scene = replace(joined(parts), origin=photos.frame.origin)
     size = save(scene, options.output)
     sys.stdout.write(f"{options.output}: {len(scene):,} splats in {size:,} bytes\n")
-    photos, splats = load_scene(blocks[0].scene), scene.decode()
+    splats = scene.decode()
     points = photos.points.double().numpy()
     seams = near_seams(points, blocks)
 

@@ -14,6 +14,7 @@ import argparse
 import logging
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -107,11 +108,12 @@ def _path(options: argparse.Namespace, splats: "Splats", is_video: bool) -> "tup
     from nsvq_lightning.rendering.camera_paths import orbit, read_camera_path, reframed, smooth_path
 
     fps, kind = options.fps or FPS, options.path
+    given = list(cameras_of(options.scene, options.root).values())
     if kind not in (None, "through", "cameras", "orbit"):
-        given, own = read_camera_path(Path(kind))
-        fps = options.fps or own
+        near = min(camera.near for camera in given or likely_cameras(splats, 1))  # which the path does not say
+        path, own = read_camera_path(Path(kind))
+        given, fps = [replace(camera, near=near) for camera in path], options.fps or own
     else:
-        given = list(cameras_of(options.scene, options.root).values())
         kind = kind or ("through" if given else "orbit")
         if not given and kind != "orbit":
             message = f"--path {kind} needs the cameras of photos: name their folder with --data.root, or take orbit"

@@ -22,7 +22,8 @@ Floats = NDArray[np.float64]
 EXTENT = 5.0
 # Places are rounded to so many steps a unit, a thousandth of a pixel: the same scene has the same bits in any unit.
 STEPS = 2.0**18
-# Cameras count up to so many times as far from their middle as four fifths of them: one lost camera is no extent.
+# Cameras more than so many times as far from their middle as four fifths of them do not count: one lost camera is no
+# extent.
 REACH = 2.0
 
 
@@ -44,8 +45,8 @@ class Frame:
     def around(cls, centres: Floats) -> "Frame":
         """The frame of cameras: 0 is the median of their centres ``[V, 3]``, and their extent is :data:`EXTENT`.
 
-        The extent is 1.1 × the largest distance from the middle, though at most :data:`REACH` times the distance of
-        four fifths of the cameras. Of cameras in one place, the unit is that of the files.
+        The extent is 1.1 × the largest distance from the middle, without cameras that are :data:`REACH` times as far
+        as four fifths of them. Of cameras in one place, the unit is that of the files.
         """
         middle = np.median(centres, axis=0)
         extent = 1.1 * reach_of(np.linalg.norm(centres - middle, axis=1))
@@ -91,7 +92,6 @@ _cameras: WeakKeyDictionary[Camera, dict[Frame, Camera]] = WeakKeyDictionary()
 
 
 def reach_of(distances: Floats) -> float:
-    """The largest of distances ``[V]``, but at most :data:`REACH` times what four fifths of them do not exceed."""
+    """The largest of distances ``[V]`` that is at most :data:`REACH` times what four fifths of them do not exceed."""
     usual = float(np.quantile(distances, 0.8, method="lower"))
-    largest = float(distances.max())
-    return min(largest, REACH * usual) if usual > 0 else largest
+    return float(distances[distances <= REACH * usual].max() if usual > 0 else distances.max())

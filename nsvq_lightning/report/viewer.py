@@ -93,6 +93,7 @@ def viewer_page(
         "cameras": [{"name": name, **camera_entry(camera)} for name, camera in cameras.items()],
         "background": list(background),
         "up": up_of(list(cameras.values())).tolist(),
+        "near": min(camera.near for camera in cameras.values()),
         "start": start,
     }
     name, connect = escape(title.encode("utf-8", "replace").decode()), "" if live is None else " connect-src 'self';"
@@ -123,14 +124,14 @@ def camera_entry(camera: Camera) -> dict[str, Any]:
 
     Returns:
         ``camera_to_world``, 16 numbers row by row, of a camera that looks along -z with y up, as in OpenGL and
-        nerfstudio; ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` in pixels; ``near`` in scene units.
+        nerfstudio; ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` in pixels.
     """
     packed = camera.packed_view
     right, down, forward, position = packed[:3], packed[3:6], packed[6:9], packed[12:]
     rows = [[right[k], -down[k], -forward[k], position[k]] for k in range(3)]
     pose = [float(f"{value:.9g}") + 0.0 for row in [*rows, [0.0, 0.0, 0.0, 1.0]] for value in row]
     intrinsics = dict(zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True))
-    return {"camera_to_world": pose, "width": camera.width, "height": camera.height, **intrinsics, "near": camera.near}
+    return {"camera_to_world": pose, "width": camera.width, "height": camera.height, **intrinsics}
 
 
 def page_cameras(path: StrPath) -> dict[str, Camera]:
@@ -145,12 +146,13 @@ def page_cameras(path: StrPath) -> dict[str, Camera]:
     cameras = {}
     opengl = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
     try:
-        for entry in json.loads(found[1])["cameras"] if found else ():
+        scene = json.loads(found[1]) if found else {"cameras": ()}
+        near = float(scene.get("near", NEAR))
+        for entry in scene["cameras"]:
             name, width, height = str(entry["name"]), int(entry["width"]), int(entry["height"])
             pose = torch.tensor(entry["camera_to_world"], dtype=torch.float64).view(4, 4)
             fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
             K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-            near = float(entry.get("near", NEAR))
             cameras[name] = Camera(K, (pose @ opengl).inverse().float(), width, height, near)
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"the cameras in {path} are damaged ({error}): name the photos with --data.root") from error

@@ -186,6 +186,7 @@ uniform mat3 rotation;     // world to camera
 uniform vec3 translation;
 uniform vec2 size;         // of the picture, pixels
 uniform vec4 lens;         // fx, fy, cx, cy, pixels
+uniform float near;        // nothing is seen before it
 flat out vec4 colour;      // opacity last
 out vec2 offset;           // from the centre, standard deviations along the axes of the ellipse
 
@@ -198,7 +199,7 @@ void main() {
   vec3 deviations = texelFetch(geometry, ivec3(at, 2), 0).xyz;
   vec3 centre = rotation * mean.xyz + translation;
   float z = centre.z, reach = 2.0 * log(mean.w * 255.0);
-  if (!(z > 0.2) || !(reach > 0.0)) return;
+  if (!(z > near) || !(reach > 0.0)) return;
 
   mat3 axes = rotation * mat3(
     1.0 - 2.0 * (q.z * q.z + q.w * q.w), 2.0 * (q.y * q.z + q.x * q.w), 2.0 * (q.y * q.w - q.x * q.z),
@@ -355,7 +356,7 @@ class Renderer {
     }
     gl.useProgram(program);
     for (const [name, slot] of Object.entries(samplers)) gl.uniform1i(gl.getUniformLocation(program, name), slot);
-    const names = ["eye", "rotation", "translation", "size", "lens", "scale"];
+    const names = ["eye", "rotation", "translation", "size", "lens", "near", "scale"];
     const at = Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]));
     return { program, at };
   }
@@ -369,7 +370,7 @@ class Renderer {
   }
 
   /** Draw what a camera (`view` below) sees over `background`, with `share` of the canvas's resolution. */
-  draw({ position, axes, fx, fy, cx, cy }, background, share) {
+  draw({ position, axes, near, fx, fy, cx, cy }, background, share) {
     const gl = this.gl, { width, height } = this.canvas;
     if (this.picture?.width !== width || this.picture?.height !== height) {
       if (this.picture) {
@@ -397,6 +398,7 @@ class Renderer {
     gl.uniform3fv(this.splat.at.translation, axes.map((axis) => -dot(axis, position)));
     gl.uniform2f(this.splat.at.size, ...size);
     gl.uniform4f(this.splat.at.lens, fx * sx, fy * sy, cx * sx, cy * sy);
+    gl.uniform1f(this.splat.at.near, near);
     gl.enable(gl.BLEND);
     gl.drawElementsInstanced(gl.TRIANGLES, 6 * GROUP, gl.UNSIGNED_SHORT, 0, this.drawn / GROUP);
     gl.disable(gl.BLEND);
@@ -412,8 +414,9 @@ class Renderer {
 
 /** Where the viewer is and what its lens sees; `frame` is the picture that stays in view whatever the window's shape. */
 class ViewPoint {
-  constructor(up) {
+  constructor(up, near) {
     this.up = unit(up);
+    this.near = near;
   }
 
   /** Take over a camera as JSON has it. */
@@ -563,20 +566,20 @@ async function load(version) {
 }
 
 /** Depth of what is in front at a place of the canvas: a low quantile of the splats around it, then of all. */
-function depthAt({ count, means, opacities }, { position, axes }, { fx, fy, cx, cy }, x, y, around) {
+function depthAt({ count, means, opacities }, { position, axes, near }, { fx, fy, cx, cy }, x, y, around) {
   for (const radius of [around, Infinity]) {
     const depths = [];
     for (let i = 0; i < count; i++) {
       if (opacities[i] < 0.3) continue;
       const d = [means[3 * i] - position[0], means[3 * i + 1] - position[1], means[3 * i + 2] - position[2]];
       const z = dot(axes[2], d);
-      if (!(z > 0.2)) continue;
+      if (!(z > near)) continue;
       const dx = (fx * dot(axes[0], d)) / z + cx - x, dy = (fy * dot(axes[1], d)) / z + cy - y;
       if (Math.hypot(dx, dy) < radius) depths.push(z);
     }
     if (depths.length > 4) return depths.sort((a, b) => a - b)[depths.length >> 2];
   }
-  return 1;
+  return 5 * near;
 }
 
 async function main() {
@@ -588,7 +591,7 @@ async function main() {
   let { engine, splats } = await load(version);
   say("Sending splats to the GPU…");
   await shown();
-  const canvas = element("canvas"), view = new ViewPoint(scene.up);
+  const canvas = element("canvas"), view = new ViewPoint(scene.up, scene.near);
   let renderer = new Renderer(canvas, splats);
   const backgrounds = [scene.background, [0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5]];
   const keys = new Set(), keyframes = [], waiting = [];
