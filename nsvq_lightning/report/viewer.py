@@ -146,7 +146,7 @@ def page_cameras(path: StrPath) -> dict[str, Camera]:
     cameras = {}
     opengl = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
     try:
-        scene = json.loads(found[1]) if found else {"cameras": ()}
+        scene: dict[str, Any] = json.loads(found[1]) if found else {"cameras": ()}
         near = float(scene.get("near", NEAR))
         for entry in scene["cameras"]:
             name, width, height = str(entry["name"]), int(entry["width"]), int(entry["height"])
