@@ -74,7 +74,7 @@ class Scene:
         names: Names of the views, sorted.
         cameras: Pinhole camera of each view, float32; scene units are those of the files.
         images: Pictures of the views, decoded at first use.
-        points: Sparse points ``[P, 3]`` float64, scene units, except those at the centre of a camera or far away.
+        points: Sparse points ``[P, 3]`` float32, scene units, except those at the centre of a camera or far away.
         colors: Their colours ``[P, 3]`` float32, RGB in [0, 1].
         train: Indices of the train views, ascending.
         test: Indices of the test views, ascending.
@@ -107,7 +107,7 @@ class Scene:
     @cached_property
     def standard(self) -> "Scene":
         """The scene in its frame."""
-        points = torch.from_numpy(self.frame.points(self.points.double().numpy()))
+        points = torch.from_numpy(self.frame.points(self.points.double().numpy())).float()
         cameras = tuple(map(self.frame.camera, self.cameras))
         return replace(self, cameras=cameras, points=points, extent=self.extent / self.frame.unit, frame=Frame())
 
@@ -214,16 +214,15 @@ def load_scene(
     extent = EXTENT * frame.unit if np.ptp(centres, axis=0).any() else 0.0
     usable = _away_from(centres, poses.points, _AT_CAMERA * extent)
     usable &= ~_astray(poses.points, "points")
-    if lost_points := np.count_nonzero(~usable):
-        log.warning(
-            "left out %d of %d points: at the centre of a camera, or far from all others", lost_points, len(usable)
-        )
+    if not usable.all():
+        text = "left out %d of %d points: they are at the centre of a camera, or far from all others"
+        log.warning(text, len(usable) - usable.sum(), len(usable))
     return Scene(
         root=root,
         names=tuple(image.name for image in poses.images),
         cameras=cameras,
         images=ImageStore(sources, cache_bytes),
-        points=torch.from_numpy(poses.points[usable]),
+        points=torch.from_numpy(poses.points[usable]).float(),
         colors=torch.from_numpy(poses.colors[usable]).float() / 255,
         train=train,
         test=test,
@@ -326,17 +325,14 @@ def _framed(model: ColmapModel, root: Path) -> tuple[ColmapModel, Frame]:
     """The frame of a model's cameras, and the model with an origin near them; warns of cameras that went astray."""
     centres = _centres(model)
     frame = Frame.around(centres)
-    if (lost := np.flatnonzero(_astray(centres, "cameras"))).size:
-        names = ", ".join(model.images[index].name for index in lost[:3])
-        log.warning(
-            "%d photos are far from all others, first %s: check their poses, or leave them out", lost.size, names
-        )
+    lost = np.flatnonzero(_astray(centres, "cameras"))
+    if len(lost):
+        first = model.images[lost[0]].name
+        log.warning("%d photos are far from all others, first %s: check its pose, or leave it out", len(lost), first)
     distance = float(np.linalg.norm(frame.middle)) / (EXTENT * frame.unit)
     if distance < _FARTHEST:
         return model, frame
-    log.info(
-        "%s: positions are relative to %s, %.0f extents away from 0, which files tell", root, frame.middle, distance
-    )
+    log.info("%s: positions are relative to %s, as 0 is %.0f extents away", root, frame.middle, distance)
     views = np.stack([image.viewmat for image in model.images])
     views[:, :3, 3] += views[:, :3, :3] @ frame.middle
     images = tuple(replace(image, viewmat=view) for image, view in zip(model.images, views, strict=True))

@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 # Extent of the cameras in a frame.
 EXTENT = 5.0
-# Places are rounded to so many steps a unit, a thousandth of a pixel: the same scene has the same bits in any unit.
+# Places are rounded to so many steps a unit, a thousandth of a pixel: cameras have the same bits in any unit.
 STEPS = 2.0**18
 # Cameras more than so many times as far from their middle as four fifths of them do not count: one lost camera is no
 # extent.

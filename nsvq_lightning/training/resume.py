@@ -13,6 +13,7 @@ from pickle import UnpicklingError
 from typing import Any, Self
 from zipfile import BadZipFile, ZipFile
 
+import numpy as np
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.model_helpers import _restricted_classmethod
@@ -193,14 +194,13 @@ def _is_harmless(text: str) -> bool:
 def scene_record(scene: Scene) -> dict[str, Any]:
     """What a checkpoint remembers of its scene: the folder's name, and a digest of the pose of each view by name.
 
-    Neither the size of the photos nor the place of the folder, masks, the choice of test views or the unit change it.
+    Neither the size of the photos nor the place of the folder, masks or the choice of test views change it.
     """
-    cameras = zip(scene.names, scene.standard.cameras, strict=True)
-    poses = {name: camera.viewmat.flatten().tolist() for name, camera in cameras}
-    digests = {
-        name: sha256(repr([round(value, 4) + 0.0 for value in pose]).encode()).hexdigest()[:8]
-        for name, pose in poses.items()
-    }
+    digests = {}
+    for name, camera in zip(scene.names, scene.cameras, strict=True):
+        rotation, centre = camera.packed_view[:9], np.array(camera.packed_view[12:]) + scene.frame.origin
+        pose = [*(round(value, 4) + 0.0 for value in rotation), f"{np.linalg.norm(centre):.3e}"]
+        digests[name] = sha256(repr(pose).encode()).hexdigest()[:8]
     return {"folder": scene.root.resolve().name, "views": digests}
 
 

@@ -134,20 +134,6 @@ def trainable_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:
     return finite_rows(attributes)
 
 
-def finite_splats(splats: Splats, source: str) -> Splats:
-    """The splats without those that :func:`trainable_rows` leaves out, with a warning that names source and attributes.
-
-    Args:
-        splats: Splats that have no optimiser yet.
-        source: Where they come from.
-
-    Raises:
-        ValueError: No finite splat is left.
-    """
-    kept = _finite_or_warn(splats, source, ValueError, "there is nothing to train")
-    return splats if bool(kept.all()) else Splats.from_tensors(*(tensor.detach()[kept] for tensor in splats.raw()))
-
-
 def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> Tensor:
     """Drop splats that :func:`trainable_rows` leaves out, with a warning that names attribute, rows and step.
 
@@ -157,18 +143,14 @@ def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> Tensor:
     Raises:
         FloatingPointError: No finite splat is left.
     """
-    kept = _finite_or_warn(splats, f"step {step}", FloatingPointError, "lower the learning rates")
-    keep_rows(splats, optimizer, kept)
-    return kept
-
-
-def _finite_or_warn(splats: Splats, where: str, error: type[Exception], advice: str) -> Tensor:
-    """Mask ``[N]`` of :func:`trainable_rows`, with a warning about the others; raises if no splat is finite."""
     kept, culprits = trainable_rows(splats)
     if culprits:
-        if not bool(kept.any()):
-            raise error(f"{where}: all {len(splats)} splats are non-finite ({listed(culprits)}); {advice}")
-        log.warning("%s: %s", where, dropped(kept, culprits))
+        if not kept.any():
+            raise FloatingPointError(
+                f"step {step}: all {len(splats)} splats are non-finite ({listed(culprits)}); lower the learning rates"
+            )
+        log.warning("step %d: %s", step, dropped(kept, culprits))
+    keep_rows(splats, optimizer, kept)
     return kept
 
 

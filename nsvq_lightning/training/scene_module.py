@@ -33,7 +33,6 @@ from nsvq_lightning.rendering.rasterize import Render, render
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, detached, sh_degree_of
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.optim import LearningRates
-from nsvq_lightning.training.row_ops import finite_splats
 from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.training.self_check import check_kernels
 from nsvq_lightning.version import __version__
@@ -308,7 +307,7 @@ def first_splats(module: SceneModule) -> Splats:
         loaded = read_scene(path).relative_to(module.frame.origin)
         if (degree := loaded.sh_degree) != sh_degree:
             raise ValueError(f"{path} has SH degree {degree}, the module has {sh_degree}; set sh_degree={degree}")
-        return finite_splats(Splats.from_tensors(*module.frame.splats(loaded.decode())), path)
+        return Splats.from_tensors(*module.frame.splats(loaded.decode()))
     scene = needed_scene(module.trainer, "no splats to start from", "set init_from").standard
     points, colors = scene.points, scene.colors
     if module.first_points is None:

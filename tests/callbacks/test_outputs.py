@@ -12,6 +12,7 @@ from nsvq_lightning.callbacks import LiveScene, PhaseSchedule
 from nsvq_lightning.callbacks import outputs as live_callback
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io import load
+from nsvq_lightning.io.compressed import CompressedScene, placed
 from nsvq_lightning.io.nsvq.header import read_header
 from nsvq_lightning.report.viewer import LIVE_SCENE, REQUEST, ask_live
 from nsvq_lightning.training.module import SplatModule
@@ -41,8 +42,8 @@ class Viewer(Callback):
             self.seen[batch_idx] = load(path)
             self.said[batch_idx] = read_header(path).config["live"]
             path.unlink()
-            hard = pl_module.hard_splats(pl_module.phase)
-            self.expected[batch_idx] = type(hard)(*(tensor.clone() for tensor in hard))
+            hard = CompressedScene.from_splats(pl_module.hard_splats(pl_module.phase))
+            self.expected[batch_idx] = placed(hard, pl_module.frame).decode().raw()
 
 
 @pytest.fixture(autouse=True)

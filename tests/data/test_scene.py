@@ -15,6 +15,7 @@ import PIL.ImageOps
 import pytest
 import torch
 from lightning.fabric.utilities import move_data_to_device
+from moved_scenes import write_moved
 from runs import quiet_trainer
 from transforms_scenes import write_blender, write_nerfstudio
 
@@ -27,15 +28,39 @@ from nsvq_lightning.training.module import SplatModule
 SceneFactory = Callable[..., Path]
 
 
-def test_a_scene_far_from_the_origin_is_warned_of(
-    make_scene: SceneFactory, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+def test_a_scene_far_from_the_origin_has_another(
+    make_scene: SceneFactory, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", logger="nsvq_lightning")
+    near, shift = load_scene(make_scene()), np.array([5e5, 4.1e6, 120.0])
+    assert "positions are relative" not in caplog.text
+    far = load_scene(write_moved(near.root, tmp_path / "far", 1.0, shift))
+    assert re.search(r"far: positions are relative to \(.*\), as 0 is \d+ extents away", caplog.text)
+    middle = np.array(near.frame.middle)
+    np.testing.assert_allclose(far.frame.origin, middle + shift, rtol=1e-9)
+    np.testing.assert_allclose(far.points, near.points.numpy() - middle, atol=1e-5)
+    for one, other in zip(near.standard.cameras, far.standard.cameras, strict=True):
+        torch.testing.assert_close(one.viewmat, other.viewmat, atol=2e-5, rtol=0)
+
+
+def test_what_is_far_from_all_others_is_named(
+    make_scene: SceneFactory, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     root = make_scene()
-    load_scene(root)
-    assert "from the origin" not in caplog.text
-    monkeypatch.setattr("nsvq_lightning.data.scene._FARTHEST", 0.01)
-    load_scene(root)
-    assert "move the origin near the cameras" in caplog.text
+    usual = load_scene(root)
+    model = import_pycolmap().Reconstruction(str(root / "sparse/0"))
+    image = model.find_image_with_name("004.png")
+    pose = image.cam_from_world().matrix()
+    pose[:, 3] = 500
+    image.frame.set_cam_from_world(image.camera_id, import_pycolmap().Rigid3d(pose))
+    for place in (1e6, -1e7):
+        model.add_point3D(np.full(3, place), import_pycolmap().Track(), np.zeros(3, np.uint8))
+    model.write_binary(str(root / "sparse/0"))
+    scene = load_scene(root)
+    assert "1 photos are far from all others, first 004.png: check its pose" in caplog.text
+    assert "left out 2 of 22 points" in caplog.text
+    assert scene.extent == pytest.approx(usual.extent, rel=0.3)
+    assert torch.equal(scene.points, usual.points)
 
 
 def test_photos_of_another_shape_than_their_camera_are_warned_of(
@@ -97,8 +122,8 @@ def test_points_and_extent(make_scene: SceneFactory) -> None:
     np.testing.assert_allclose(scene.points.numpy(), [reconstruction.points3D[i].xyz for i in ids], rtol=1e-6)
     np.testing.assert_allclose(scene.colors.numpy() * 255, [reconstruction.points3D[i].color for i in ids], atol=1e-4)
     assert scene.points.dtype == scene.colors.dtype == torch.float32
-    centres = np.stack([-scene.cameras[i].viewmat[:3, 3].numpy() for i in scene.train])  # rotations are 1
-    expected = 1.1 * np.linalg.norm(centres - centres.mean(0), axis=1).max()
+    centres = np.stack([-camera.viewmat[:3, 3].numpy() for camera in scene.cameras])  # rotations are 1
+    expected = 1.1 * np.linalg.norm(centres - np.median(centres, axis=0), axis=1).max()
     assert scene.extent == pytest.approx(expected, rel=1e-6)
 
 

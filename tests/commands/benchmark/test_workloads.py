@@ -53,7 +53,7 @@ def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path) -> N
 
 
 def test_folder_is_seen_by_its_first_train_camera(demo_scene: Path) -> None:
-    scene = load_scene(demo_scene)
+    scene = load_scene(demo_scene).standard
     (workload,) = workloads(Scope(scene=demo_scene))
     assert torch.equal(workload.camera.viewmat, scene.cameras[scene.train[0]].viewmat)
     assert torch.equal(workload.splats.means, scene.points)

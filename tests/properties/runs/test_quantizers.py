@@ -85,13 +85,19 @@ def finished(request: pytest.FixtureRequest, run: RunFactory, quantized_recipe: 
     return request.param, trainer, module, books
 
 
+def in_files(module: SplatModule, name: str, codebook: torch.Tensor) -> np.ndarray:
+    """A codebook of the module's frame in the unit of its files: lengths are logarithms."""
+    rows = codebook.detach().numpy()
+    return rows if name != "scales" else (rows + np.log(module.frame.unit)).astype(np.float32)
+
+
 def test_the_file_holds_the_frozen_codes_and_the_fine_tuned_codebooks(finished: Finished) -> None:
     kind, trainer, module, books = finished
     stored = read_nsvq(scene_path(trainer))
     assert stored.config["quantizers"] == dict.fromkeys(module.quantizers, kind.__name__)
     for name, quantizer in module.quantizers.items():
         assert np.array_equal(stored.codes[name], quantizer.codes.numpy())
-        assert np.array_equal(stored.codebooks[name], quantizer.codebook.detach().numpy())
+        assert np.array_equal(stored.codebooks[name], in_files(module, name, quantizer.codebook))
         # Raw attributes stand still in fine-tuning; codes are the nearest ones of its start.
         rows, book = module.rows(name), books.at[QUANTIZE_END][name]
         assert_nearest(quantizer.codes, rows, kmeans(rows, len(book), generator(0)) if kind is PostHoc else book)
@@ -146,7 +152,7 @@ def test_post_hoc_stores_kmeans_of_the_final_rows(run: RunFactory, recipe: Recip
     for name, quantizer in module.quantizers.items():
         rows = module.rows(name)
         expected = kmeans(rows, quantizer.codebook.shape[0], generator(0))
-        assert np.array_equal(stored.codebooks[name], expected.numpy())
+        assert np.array_equal(stored.codebooks[name], in_files(module, name, expected))
         assert_nearest(torch.from_numpy(stored.codes[name].astype(np.int64)), rows, expected)
     # To look at it on the way changes nothing.
     assert scene_path(fit(MetricReport(every=7))[0]).read_bytes() == scene_path(trainer).read_bytes()

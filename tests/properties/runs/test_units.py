@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -41,7 +42,7 @@ def test_a_run_is_the_same_in_any_unit(
     scene = write_moved(demo_scene, tmp_path / "scene", unit, shift)
     folder = fitted(scene, tmp_path / "run")
     one, other = (read(each / "checkpoints" / "last.ckpt")["state_dict"] for each in (usual, folder))
-    if shift[0] < 1e4:
+    if math.log2(unit).is_integer() and not any(shift):
         same = [key for key in one if key != "_extra_state" and torch.equal(one[key], other[key])]
         assert len(same) == len(one) - 1
     first, second = read_scene(usual / "scene.nsvq"), read_scene(folder / "scene.nsvq")
