@@ -1,13 +1,15 @@
 """Points where the photos have detail, from the optical flow between neighbouring train photos."""
 
+from collections.abc import Iterable, Sized
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from tqdm import tqdm
 
 from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.compute.memory import trim
@@ -17,6 +19,7 @@ from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.random import draw_rows, generator
 
 Floats = NDArray[np.float64]
+T = TypeVar("T")
 
 
 class _Photo(NamedTuple):
@@ -84,11 +87,14 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     cv2.setNumThreads(1)  # with several, DIS works in stripes, and its bits depend on how many
     try:
         with ThreadPoolExecutor(usable_cores()) as pool:
-            photos = list(pool.map(lambda index: _photo(scene, index, known), scene.train))
+            photos = list(
+                _shown("photos", pool.map(lambda index: _photo(scene, index, known), scene.train), scene.train)
+            )
             pairs = _neighbours(photos)
             pixels = 2 * len(pairs) * photos[0].grey.size
             stride = max(2, int(np.ceil(np.sqrt(pixels / MOST_CANDIDATES))))
-            found = [each for two in pool.map(lambda pair: _triangulated(pair, stride), pairs) for each in two]
+            flows = _shown("flows", pool.map(lambda pair: _triangulated(pair, stride), pairs), pairs)
+            found = [each for two in flows for each in two]
     finally:
         cv2.setNumThreads(threads)
     if not found:
@@ -109,6 +115,11 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     del positions, colors, detail, cells, cell, crowd, weight
     trim()
     return chosen
+
+
+def _shown(what: str, results: Iterable[T], of: Sized) -> Iterable[T]:
+    """The results, with a bar on a terminal."""
+    return tqdm(results, f"dense start: {what}", len(of), leave=False, disable=None)
 
 
 # Photos are looked at with at most so many pixels on their longer side.

@@ -313,6 +313,7 @@ def first_splats(module: SceneModule) -> Splats:
     if module.first_points is None:
         return Splats.from_points(points, colors, sh_degree)
     if (missing := module.first_points - len(points)) > 0:
+        log.info("dense start: looking for %d points that neighbouring photos show, beside those of SfM", missing)
         start = time.perf_counter()
         more, their_colors = dense_points(scene, missing, module.seed)
         log.info("dense start: %d points beside %d of SfM, %.1f s", len(more), len(points), time.perf_counter() - start)
