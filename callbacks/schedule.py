@@ -42,7 +42,8 @@ class PhaseSchedule(SplatCallback):
             ``trainer.max_steps`` whatever the photos; ``total`` goes before it.
         least_iterations: What ``iterations_per_photo`` leaves in any case.
         minutes: Time to train on this machine, instead of a number of iterations: as many are chosen as measured steps
-            are likely to allow. ``config.yaml`` of the run has their number.
+            are likely to allow, and fine-tuning then ends when the time is over: not before half of it, and a quarter
+            of the run later at most. ``config.yaml`` of the run has both numbers.
 
     Raises:
         ValueError: A number is out of range; or see :class:`~nsvq_lightning.training.schedule.Schedule`.
@@ -74,6 +75,8 @@ class PhaseSchedule(SplatCallback):
     _asked: int = field(default=-1, init=False)
     _max_steps: int | None = field(default=None, init=False)
     """What this callback has set in the trainer, which a next fit does not take for what was asked."""
+    passing = ("_tuned_since",)
+    _tuned_since: float | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -97,6 +100,26 @@ class PhaseSchedule(SplatCallback):
         trainer.fit_loop.epoch_loop.max_steps = self._max_steps = steps
         if trainer.max_steps != steps:
             raise RuntimeError(f"this version of Lightning keeps max_steps={trainer.max_steps}: set it to {steps}")
+
+    def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
+        """Once a fifth of fine-tuning has been timed, let the run end when its minutes are over."""
+        first, end = module.schedule.first_of(Phase.FINETUNE), module.schedule.ends[-1]
+        if self.minutes is None or first is None or iteration < first:
+            return
+        timed = (end - first) // 5
+        module.stopwatch.lap()
+        seconds = module.stopwatch.seconds
+        if iteration == first:
+            self._tuned_since = seconds
+        elif iteration == first + timed and self._tuned_since is not None:
+            pace = (seconds - self._tuned_since) / timed
+            planned = end - iteration
+            left = min(
+                max(round((60 * self.minutes - seconds) / pace), planned // 2), planned + module.schedule.part(4)
+            )
+            left = trainer.strategy.broadcast(left)
+            self._steps = iteration + left + module.schedule.saved
+            log.info("iterations: %d, as they take %.0f ms each now", self._steps, 1000 * pace)
 
     def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Set the module's schedule.
@@ -162,6 +185,7 @@ class PhaseSchedule(SplatCallback):
         if self._steps > 0:
             self._set_max_steps(trainer, self._steps - module.schedule.saved)
         module.phase = module.schedule.phase_at(trainer.global_step + 1)
+        super().on_train_batch_start(trainer, module, batch, batch_idx)
 
 
 @dataclass(eq=False)

@@ -90,6 +90,8 @@ typehints.discard_init_args_on_class_path_change = _drop_settings_of_another_cla
 class RunStart(SaveConfigCallback):
     """Opens the run: makes its folder and default loggers, and writes the settings to ``config.yaml`` atomically."""
 
+    by_minutes = False
+
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Open it as soon as the scene has been loaded, before anything is logged."""
         folder = run_folder(trainer)  # a collective of all processes
@@ -105,12 +107,24 @@ class RunStart(SaveConfigCallback):
                 callback.dirpath = str(folder / "checkpoints")
         if trainer.is_global_zero:
             phases = self.config.get("callbacks.phases.init_args", {})
-            if phases.get("minutes") is not None:  # the iterations that were chosen, so that the run can be repeated
+            self.by_minutes = phases.get("minutes") is not None
+            if self.by_minutes:  # the iterations that were chosen, so that the run can be repeated
                 self.config["trainer.max_steps"] = trainer.max_steps
                 phases.minutes = phases.iterations_per_photo = None
             root = self.config.get("data.init_args.root")
             if isinstance(root, str):  # so that it is found from any folder
                 self.config["data.init_args.root"] = os.path.abspath(root)
+            self._write(folder)
+
+    def on_train_end(self, trainer: Trainer, pl_module: SplatModule) -> None:  # type: ignore[override]
+        """Note how many iterations the minutes have come to."""
+        if self.by_minutes:
+            self.config["callbacks.phases.init_args.total"] = pl_module.schedule.total
+            self.config["trainer.max_steps"] = trainer.max_steps + pl_module.schedule.saved
+            self._write(run_folder(trainer))
+
+    def _write(self, folder: Path) -> None:
+        with optional(folder / self.config_filename):
             write_text(folder / self.config_filename, self.parser.dump(self.config, skip_none=False))
 
 

@@ -119,7 +119,8 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
 
 def _shown(what: str, results: Iterable[T], of: Sized) -> Iterable[T]:
     """The results, with a bar on a terminal."""
-    return tqdm(results, f"dense start: {what}", len(of), leave=False, disable=None)
+    bar: Iterable[T] = tqdm(results, f"dense start: {what}", len(of), leave=False, disable=None)
+    return bar
 
 
 # Photos are looked at with at most so many pixels on their longer side.

@@ -89,3 +89,21 @@ class Several:
     @property
     def max_steps(self) -> int:
         return int(self.fit_loop.epoch_loop.max_steps)
+
+
+@pytest.mark.parametrize(("milliseconds", "after"), [(10, 0), (9, 222), (5, 500), (10.5, -95), (30, -127)])
+def test_fine_tuning_ends_with_the_minutes(milliseconds: float, after: int) -> None:
+    """2000 iterations were to take 10 ms each; how many more or fewer there are if they take something else.
+
+    Half of fine-tuning stays, and a quarter of the run is the most.
+    """
+    phases = PhaseSchedule(minutes=20 / 60)
+    schedule = phases.schedule(2000)
+    phases._steps = 2000
+    watch = SimpleNamespace(seconds=0.0, lap=lambda: None)
+    module: Any = SimpleNamespace(schedule=schedule, stopwatch=watch)
+    trainer: Any = SimpleNamespace(strategy=SimpleNamespace(broadcast=lambda value: value))
+    for iteration in range(1, 2001):
+        phases.before_step(trainer, module, iteration)
+        watch.seconds += milliseconds / 1000
+    assert phases._steps == pytest.approx(2000 + after, abs=2)

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from checkpoints import assert_same_end
 from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import BUDGET, ENDS, RECIPE_MODULE, Recipe, RunFactory, Whole, paper_replacement, recipe_options
 from torch import Tensor
 
+from checkpoints import assert_same_end
 from nsvq_lightning.callbacks import (
     BudgetedGrowth,
     CanonicalCovariance,
@@ -330,8 +330,9 @@ def test_minutes_choose_the_iterations(
         trainer, module = run(recipe(**options).values(), module=RECIPE_MODULE)
     points = forecast.stretches(module.schedule, BudgetedGrowth(full=ENDS["warmup_end"]), 100, BUDGET)[0][1]
     assert 100 < points < 2 * BUDGET
-    assert 1 < trainer.global_step == trainer.max_steps == module.schedule.total
-    assert f"iterations: {trainer.max_steps}, about 0.5 min of training" in caplog.text
+    total = module.schedule.total
+    assert 1 < total <= trainer.global_step == trainer.max_steps <= total + total // 4  # it is faster than that
+    assert f"iterations: {total}, about 0.5 min of training" in caplog.text
 
 
 def test_a_run_of_some_minutes_can_be_repeated(
@@ -343,5 +344,5 @@ def test_a_run_of_some_minutes_can_be_repeated(
     assert main(["fit", f"--data.root={demo_scene}", "--minutes=0.1", *options]) == 0
     settings = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
     phases = settings["callbacks"]["phases"]["init_args"]
-    assert settings["trainer"]["max_steps"] == round(6 / forecast.LOOP)
+    assert phases["total"] == round(6 / forecast.LOOP) <= settings["trainer"]["max_steps"]
     assert phases["minutes"] is phases["iterations_per_photo"] is None
