@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
@@ -204,6 +203,8 @@ def _mean_squared_neighbour_distance(points: Tensor) -> Tensor:
     neighbours = min(3, points.shape[0] - 1)
     if neighbours == 0:
         return torch.ones(1)
+    from scipy.spatial import cKDTree  # takes longer to import than all that a render needs beside torch
+
     positions = points.double().numpy()
     distance, _ = cKDTree(positions).query(positions, k=neighbours + 1, workers=-1)
     return torch.from_numpy(np.square(distance[:, 1:]).mean(1)).float()

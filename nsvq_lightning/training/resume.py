@@ -283,14 +283,6 @@ class ResumedModule(SceneModule):
         check_settings(checkpoint_path, {k: v for k, v in stored.items() if k not in settings})
         return super().load_from_checkpoint(checkpoint_path, *args, **settings)
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        # Lightning writes it before and after each of some thirty hooks of a step; nn.Module would look for a
-        # parameter.
-        if name == "_current_fx_name":
-            object.__setattr__(self, name, value)
-        else:
-            super().__setattr__(name, value)
-
     def get_extra_state(self) -> Tensor:
         """Phase, SH degree, extent, seconds of training, unit, middle and origin of the frame ``[11]``, float64."""
         self.stopwatch.lap()

@@ -2,13 +2,11 @@
 
 import logging
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch import Trainer
-from lightning.pytorch.profilers import PassThroughProfiler
 from lightning.pytorch.strategies import DDPStrategy
 
 from nsvq_lightning.compute.devices import best_device
@@ -17,15 +15,6 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import PlainCheckpointIO, read_checkpoint
 
 log = logging.getLogger(__name__)
-
-
-class _NoProfiler(PassThroughProfiler):
-    """Lightning's default, without the generator that it makes for each of the hundred hooks and actions of a step."""
-
-    _nothing: Any = nullcontext()
-
-    def profile(self, action_name: str) -> Any:
-        return self._nothing
 
 
 # What Lightning's trainer has otherwise.
@@ -62,8 +51,6 @@ class SplatTrainer(Trainer):
             kwargs.setdefault(name, value)
         if kwargs.get("accelerator", "auto") == "auto":
             kwargs["accelerator"] = best_device().type
-        if kwargs.get("profiler") is None:
-            kwargs["profiler"] = _NoProfiler()
         several = "view_parallel_notebook" if hasattr(sys, "ps1") else "view_parallel"
         if kwargs.get("strategy") == "view_parallel":
             kwargs["strategy"] = several
