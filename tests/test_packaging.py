@@ -46,8 +46,8 @@ def _pins() -> dict[str, str]:
 
 def test_compromised_releases_of_lightning_cannot_be_installed() -> None:
     allowed = _requirements()["lightning"].specifier
-    assert [version for version in ("2.5.5", "2.6.2", "2.6.3", "2.6.6", "3.0") if version in allowed] == [
-        "2.5.5",
+    assert [version for version in ("2.6.1", "2.6.2", "2.6.3", "2.6.6", "3.0") if version in allowed] == [
+        "2.6.1",
         "2.6.6",
     ]
 

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numba.core.registry import CPUDispatcher
-from numpy.lib.array_utils import byte_bounds
 from torch import Tensor
 
 GUARD = 4096
@@ -106,10 +105,18 @@ def _replaced(value: Any, copies: dict[int, Any]) -> Any:
     return value
 
 
+def _span(array: Any) -> tuple[int, int]:
+    """Where an array begins and ends in memory; NumPy's function for it is in another place before 2.0."""
+    first = array.__array_interface__["data"][0]
+    reach = [(length - 1) * stride for length, stride in zip(array.shape, array.strides, strict=True)]
+    low, high = (sum(pick(way, 0) for way in reach) for pick in (min, max))
+    return first + low, first + high + array.itemsize
+
+
 def _blocks(arrays: list[Any], word: int) -> list[_Block]:
     """A block for each array; one for those that share memory, such as records as floats and as integers."""
     spans: list[list[int]] = []
-    for low, high in sorted(byte_bounds(array) for array in arrays if array.size):
+    for low, high in sorted(_span(array) for array in arrays if array.size):
         if spans and low < spans[-1][1]:
             spans[-1][1] = max(spans[-1][1], high)
         else:
@@ -121,7 +128,7 @@ def _block_of(array: Any, blocks: list[_Block]) -> _Block:
     """The block of an array; that of no bytes for an empty one."""
     if array.size == 0:
         return blocks[-1]
-    low, _ = byte_bounds(array)
+    low, _ = _span(array)
     return next(block for block in blocks if block.low <= low < block.high)
 
 

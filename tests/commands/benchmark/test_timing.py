@@ -96,6 +96,6 @@ def test_tables_name_the_machine_and_every_operation() -> None:
 
 def test_the_machine_is_described() -> None:
     machine, versions = timing.describe_machine()
-    assert f", torch {torch.__version__}, " in versions
+    assert f", torch {torch.__version__.partition('+')[0]}" in versions
     assert machine.startswith("cpu ")
     assert "None" not in machine

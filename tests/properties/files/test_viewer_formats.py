@@ -176,7 +176,7 @@ def test_spz_has_the_axes_that_it_states(tmp_path: Path, number: int, axes: str)
     theirs, ours = (
         turn * np.exp(a.scales)[:, None] @ turn.transpose(0, 2, 1)
         for a in (stored, read)
-        for turn in [Rotation.from_quat(a.quats, scalar_first=True).as_matrix()]
+        for turn in [Rotation.from_quat(np.roll(a.quats, -1, axis=1)).as_matrix()]
     )
     np.testing.assert_allclose(ours, to_ours @ theirs @ to_ours.T, atol=1e-5)
     directions = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
