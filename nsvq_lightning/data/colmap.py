@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.data import NO_FOLDER
 from nsvq_lightning.data import colmap_tables as tables
+from nsvq_lightning.data.pinhole import Pinhole
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +60,7 @@ class ColmapModel:
 
     Attributes:
         images: Registered images, sorted by name.
-        cameras: ``pycolmap.Camera`` by id.
+        cameras: ``pycolmap.Camera`` by id, of those without distortion :class:`~nsvq_lightning.data.pinhole.Pinhole`.
         points: Sparse points ``[P, 3]`` float64, scene units, sorted by COLMAP's point id; maybe none.
         colors: Their colours ``[P, 3]`` uint8 RGB.
         observations: Row of the point and row of the image of each sighting ``[O, 2]`` int64; None unless requested.
@@ -94,8 +95,8 @@ def import_pycolmap() -> Any:
         import pycolmap
     except ModuleNotFoundError as error:
         raise SceneError(
-            "pycolmap, which reads and writes COLMAP models, is not installed (it has no wheel for Linux on ARM64): "
-            "build it, or give a folder with a transforms.json"
+            "pycolmap, which places cameras and undistorts photos, is not installed (it has no wheel for Linux on "
+            "ARM64): build it, or undistort the photos elsewhere (colmap image_undistorter)"
         ) from error
     return pycolmap
 
@@ -202,8 +203,7 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
     if not root.is_dir():
         raise SceneError(NO_FOLDER.format(root))
     files = model_files(root, chosen)
-    known = _lens_models()
-    cameras = {row.number: row for row in _table(files["cameras"], lambda path: tables.read_cameras(path, known))}
+    cameras = {row.number: row for row in _table(files["cameras"], tables.read_cameras)}
     rows = sorted(_table(files["images"], tables.read_images), key=lambda row: row.name)
     if not rows:
         raise SceneError(f"{files['images']} lists no registered image: run COLMAP's mapper again")
@@ -224,14 +224,6 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
         colors=rgb_bytes(points.rgb),
         observations=_observations(rows, points.tracks) if observations else None,
     )
-
-
-def _lens_models() -> tables.LensModels:
-    """The camera models of this pycolmap."""
-    pycolmap = import_pycolmap()
-    models = [model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"]
-    make = pycolmap.Camera.create_from_model_id
-    return {int(model.value): (model.name, len(make(1, model, 1.0, 1, 1).params)) for model in models}
 
 
 _Rows = TypeVar("_Rows", bound=Sized)
@@ -286,7 +278,7 @@ def _viewmats(rows: Sequence[tables.ImageRow], path: Path) -> NDArray[np.float64
 
 
 def _camera(row: tables.CameraRow, path: Path) -> Any:
-    """The ``pycolmap.Camera``.
+    """The camera of a row, see :func:`lens`.
 
     Raises:
         SceneError: It is damaged.
@@ -298,9 +290,26 @@ def _camera(row: tables.CameraRow, path: Path) -> Any:
             f"{', '.join(map(str, row.params))}; needed are sizes from 1 to {LARGEST_SIDE}, finite numbers and a focal "
             "length above 0: copy the model again or run COLMAP again"
         )
-    return import_pycolmap().Camera(
-        model=row.model, width=row.width, height=row.height, params=row.params, camera_id=row.number
-    )
+    return lens(row.number, row.model, row.width, row.height, row.params)
+
+
+def lens(number: int, model: str, width: int, height: int, params: tuple[float, ...]) -> Any:
+    """A camera: :class:`~nsvq_lightning.data.pinhole.Pinhole` without distortion, else a ``pycolmap.Camera``.
+
+    Args:
+        number: Its identifier.
+        model: COLMAP's name of its model.
+        width: Pixels.
+        height: Pixels.
+        params: COLMAP's parameters of the model.
+
+    Raises:
+        SceneError: It has distortion, and pycolmap is not installed.
+    """
+    if model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return Pinhole.of(params, width, height, number)
+    pycolmap = import_pycolmap()
+    return pycolmap.Camera(model=model, width=width, height=height, params=list(params), camera_id=number)
 
 
 def rgb_bytes(values: NDArray[np.float64], floats: bool = False) -> NDArray[np.uint8]:

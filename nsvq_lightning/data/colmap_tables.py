@@ -7,7 +7,7 @@ spaces, images without a second line, colours of any kind, points without identi
 import mmap
 import re
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -50,23 +50,40 @@ class PointTable(NamedTuple):
 
 
 # Camera models by COLMAP's number: their name, and how many parameters they have.
-LensModels = Mapping[int, tuple[str, int]]
+LENSES = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
+}
 
 
-def read_cameras(path: Path, models: LensModels) -> list[CameraRow]:
+def read_cameras(path: Path) -> list[CameraRow]:
     """The cameras in ``cameras.bin`` or ``cameras.txt``.
 
     Args:
         path: The file.
-        models: The known camera models.
 
     Raises:
         ValueError: The file is damaged, or a camera has an unknown model.
     """
     if path.suffix.lower() == ".bin":
-        return list(_records(path, lambda data, start: _camera_record(data, start, models)))
-    counts = dict(models.values())
-    return [_camera_line(line, text.split(), counts) for line, text in _lines(path)]
+        return list(_records(path, _camera_record))
+    return [_camera_line(line, text.split()) for line, text in _lines(path)]
 
 
 def read_images(path: Path) -> list[ImageRow]:
@@ -151,14 +168,13 @@ def _records(path: Path, record: Callable[[mmap.mmap, int], tuple[_Row, int]]) -
             raise ValueError(f"it is garbled: its {count} declared records end at byte {end} of {size}")
 
 
-def _camera_record(data: mmap.mmap, start: int, models: LensModels) -> tuple[CameraRow, int]:
+def _camera_record(data: mmap.mmap, start: int) -> tuple[CameraRow, int]:
     number, model, width, height = _CAMERA.unpack_from(data, start)
-    if model not in models:
+    if model not in LENSES:
         raise struct.error(
-            f"camera {number} has model id {model} and size {width}x{height}; this pycolmap knows the ids 0 to "
-            f"{max(models)}"
+            f"camera {number} has model id {model} and size {width}x{height}; known are the ids 0 to {max(LENSES)}"
         )
-    name, count = models[model]
+    name, count = LENSES[model]
     params = struct.unpack_from(f"<{count}d", data, start + _CAMERA.size)
     return CameraRow(number, name, width, height, params), start + _CAMERA.size + 8 * count
 
@@ -215,11 +231,11 @@ def _numbers(line: int, words: Sequence[str]) -> list[float]:
     return numbers
 
 
-def _camera_line(line: int, words: Sequence[str], counts: Mapping[str, int]) -> CameraRow:
+def _camera_line(line: int, words: Sequence[str]) -> CameraRow:
     if len(words) < 4:
         raise ValueError(f"line {line} has {len(words)} words; a camera has identifier, model, width, height, numbers")
     number, width, height, *params = _numbers(line, [words[0], *words[2:]])
-    model = words[1].upper()
+    model, counts = words[1].upper(), dict(LENSES.values())
     if model not in counts:
         raise ValueError(f"line {line}: camera {number:g} has the model {model}; known are {', '.join(counts)}")
     if len(params) != counts[model]:

@@ -20,6 +20,7 @@ from torch import Tensor
 from nsvq_lightning.data import PANORAMA
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap
 from nsvq_lightning.data.edges import Edges, edges_of
+from nsvq_lightning.data.pinhole import Pinhole
 
 
 def _undecodable(path: Path, reason: str) -> SceneError:
@@ -219,7 +220,7 @@ class ImageSource:
     path: Path
     size: tuple[int, int]
     undistortion: "Undistortion | None"
-    pinhole: "Pinhole"
+    pinhole: Pinhole
     orientation: int = 1
     mask: Path | None = None
     has_alpha: bool = False
@@ -356,26 +357,6 @@ log = logging.getLogger(__name__)
 Maps = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]
 
 
-@dataclass(frozen=True, eq=False)
-class Pinhole:
-    """Intrinsics and size of a pinhole image.
-
-    Attributes:
-        K: ``[3, 3]`` float64, pixels, centres at .5.
-        width: Pixels.
-        height: Pixels.
-    """
-
-    K: NDArray[np.float64]
-    width: int
-    height: int
-
-    def resized(self, width: int, height: int) -> "Pinhole":
-        """The camera of the image scaled to another size; with centres at .5 the whole of ``K`` scales linearly."""
-        scale = np.diag([width / self.width, height / self.height, 1.0])
-        return Pinhole(scale @ self.K, width, height)
-
-
 class Undistortion:
     """Mapping from the images of a distorted camera to those of a pinhole camera, cropped so that no pixel is blank.
 
@@ -472,7 +453,7 @@ def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> tup
     """Pinhole camera of the undistorted images, and how to undistort them (None if there is nothing to do).
 
     Args:
-        camera: ``pycolmap.Camera`` of any model.
+        camera: ``pycolmap.Camera`` of any model, or a pinhole.
         width: Width of the image files in pixels; may differ from the model's.
         height: Height of the image files in pixels.
         keep_maps: See :class:`Undistortion`.

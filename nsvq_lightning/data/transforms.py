@@ -205,11 +205,7 @@ def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> Colm
     chosen = {name: frame for name, frame in sorted(chosen.items()) if name in train | test or not is_split}
     lenses = {name: frame.lens() for name, frame in chosen.items()}
     numbers = {lens: number for number, lens in enumerate(dict.fromkeys(lenses.values()), start=1)}
-    pycolmap = colmap.import_pycolmap()
-    cameras = {
-        number: pycolmap.Camera(model=model, width=width, height=height, params=list(params), camera_id=number)
-        for (model, width, height, params), number in numbers.items()
-    }
+    cameras = {number: colmap.lens(number, *lens) for lens, number in numbers.items()}
     tops = {PurePosixPath(name).parts[0] if "/" in name else "." for name in chosen}
     folder = tops.pop() if len(tops) == 1 else "."
     images = tuple(

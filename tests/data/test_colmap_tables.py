@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from nsvq_lightning.data.colmap_tables import read_cameras, read_images, read_points
+from nsvq_lightning.data.colmap import import_pycolmap
+from nsvq_lightning.data.colmap_tables import LENSES, read_cameras, read_images, read_points
 
-MODELS = {1: ("PINHOLE", 4)}
 POSE = "1 0 0 0 0.5 -1e-002 2"
 TWO_LINES = f"# IMAGE_ID, ...\n1 {POSE} 1 a b (2).jpg\n1.5 2 -1 3 4.5 6\n2 {POSE} 1 cam/c.png\n\n"
 NAMES = ["a b (2).jpg", "cam/c.png"]
@@ -62,7 +62,7 @@ def test_points_as_text(tmp_path: Path, line: str, tracks: list[int]) -> None:
         ("1 PINHOLE 40 32 30 30 20", "line 2: camera 1 of model PINHOLE has 3 parameters in place of 4"),
         ("1 PINHOLE 40 32 -nan(ind) 30 20 16", r"line 2 has '-nan\(ind\)' in place of a number"),
         ("1 PINHOLE 40 32 30,5 30 20 16", "line 2 has '30,5' in place of a number; decimals need a point"),
-        ("1 FISHEYE_X 40 32 30", "line 2: camera 1 has the model FISHEYE_X; known are PINHOLE"),
+        ("1 FISHEYE_X 40 32 30", "line 2: camera 1 has the model FISHEYE_X; known are SIMPLE_PINHOLE, PINHOLE"),
         ("1 PINHOLE", "line 2 has 2 words"),
     ],
 )
@@ -70,7 +70,7 @@ def test_cameras_that_cannot_be_read_are_named(tmp_path: Path, line: str, messag
     path = tmp_path / "cameras.txt"
     path.write_text(f"# cameras\n{line}\n")
     with pytest.raises(ValueError, match=message):
-        read_cameras(path, MODELS)
+        read_cameras(path)
 
 
 @pytest.mark.parametrize(
@@ -86,3 +86,10 @@ def test_images_that_cannot_be_read_are_named(tmp_path: Path, text: str, message
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
         read_images(path)
+
+
+def test_the_camera_models_are_those_of_colmap() -> None:
+    pycolmap = import_pycolmap()
+    known = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    make = pycolmap.Camera.create_from_model_id
+    assert {int(m.value): (name, len(make(1, m, 1.0, 1, 1).params)) for name, m in known.items()} == LENSES

@@ -24,7 +24,7 @@ def write_small_demo(root: Path, views: int, width: int, height: int, points: in
     chosen = [demo.images[round(len(demo.images) * view / views)] for view in range(views)]
     full = demo.cameras[chosen[0].camera_id]
     factors = np.array([width / full.width, height / full.height])
-    lens = np.array(full.params) * np.tile(factors, 2)
+    lens = full.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]] * np.tile(factors, 2)
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=lens.tolist(), camera_id=1)
     model.add_camera_with_trivial_rig(camera)

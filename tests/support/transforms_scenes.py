@@ -31,7 +31,7 @@ def write_nerfstudio(colmap: Path, root: Path, applied: Any = None, moved_points
     model = read_model(colmap)
     shutil.copytree(colmap / "images", root / "images")
     (camera,) = model.cameras.values()
-    fx, fy, cx, cy = camera.params
+    fx, fy, cx, cy = camera.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     values = {
         "camera_model": "OPENCV", "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": camera.width, "h": camera.height,
         "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "ply_file_path": "points.ply", **head,
