@@ -14,6 +14,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.quantize.attributes import attribute_rows, codes_of
 from nsvq_lightning.quantize.codebook import Quantizer
 from nsvq_lightning.splats.attributes import QUANTIZABLE, dropped, finite_rows
+from nsvq_lightning.splats.conventions import Float32s
 from nsvq_lightning.splats.splats import RawSplats, sh_degree_of
 
 log = logging.getLogger(__name__)
@@ -50,7 +51,7 @@ def _numpy(tensor: Tensor) -> NDArray[Any]:
 
 
 @torch.no_grad()
-def components(rows: Tensor, weights: Tensor, step: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def components(rows: Tensor, weights: Tensor, step: float) -> tuple[Float32s, Float32s]:
     """Coefficients and a basis of rows x, chosen by weighted error and bits.
 
     The basis are the principal axes of the rows, weighted, times a step. Of each row, the coefficients c have the least

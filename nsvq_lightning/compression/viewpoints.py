@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.data.images import ImageStore, Picture
@@ -17,13 +16,14 @@ from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT, Frame
 from nsvq_lightning.rendering.poses import poses, view_towards
 from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.splats.conventions import Float32s, Float64s
 from nsvq_lightning.splats.splats import SplatTensors
 
 # Near plane of a guessed camera, as a share of the distance to what it looks at.
 NEARNESS = 0.02
 
 
-def look_at(target: NDArray[np.float64], eye: NDArray[np.float64], width: int, height: int, angle: float) -> Camera:
+def look_at(target: Float64s, eye: Float64s, width: int, height: int, angle: float) -> Camera:
     """A camera at ``eye [3]`` that has ``target [3]`` in its centre, y down.
 
     Args:
@@ -39,7 +39,7 @@ def look_at(target: NDArray[np.float64], eye: NDArray[np.float64], width: int, h
     return Camera(intrinsics, view, width, height, NEARNESS * float(np.linalg.norm(target - eye)) or NEAR)
 
 
-def middle_of(means: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
+def middle_of(means: Float32s) -> tuple[Float64s, float]:
     """The median ``[3]`` of positions ``[N, 3]``, N > 0, and the distance from it within which four fifths lie."""
     points = means.astype(np.float64)
     middle = np.median(points, axis=0)

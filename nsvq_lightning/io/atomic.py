@@ -10,9 +10,11 @@ from typing import BinaryIO
 
 log = logging.getLogger(__name__)
 
+StrPath = str | os.PathLike[str]
+
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_path(path: StrPath) -> Iterator[Path]:
     """Path of a temporary file to write, which is renamed to ``path`` only when the block ends without an error.
 
     The file is in the same folder, is flushed to disk (fsync), and is renamed over ``path`` in one step
@@ -52,7 +54,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+def atomic_write(path: StrPath) -> Iterator[BinaryIO]:
     """Open a binary file for writing that is renamed to ``path`` only when the block ends without an error.
 
     Arguments and errors are those of :func:`atomic_path`; a new file gets default permissions.
@@ -64,19 +66,19 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         yield file
 
 
-def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
+def write_bytes(path: StrPath, content: bytes) -> None:
     """Write a file in one step, see :func:`atomic_write`."""
     with atomic_write(path) as file:
         file.write(content)
 
 
-def write_text(path: str | os.PathLike[str], text: str) -> None:
+def write_text(path: StrPath, text: str) -> None:
     """Write a text file as UTF-8 in one step, see :func:`atomic_write`."""
     write_bytes(path, text.encode())
 
 
 @contextmanager
-def optional(path: str | os.PathLike[str]) -> Iterator[None]:
+def optional(path: StrPath) -> Iterator[None]:
     """Warn if what the block writes to ``path`` cannot be written, and go on: for what a run can do without.
 
     A program may hold the file open, as Windows lets it, or the disk be full.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.splats import attributes as splat
-from nsvq_lightning.splats.conventions import shN_degree, turned
+from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s, shN_degree, turned
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.frame import Frame
@@ -48,17 +48,17 @@ class CompressedScene:
         TypeError: An array is not float32 (codes: not of an integer type).
     """
 
-    means: NDArray[np.float32]
-    opacities: NDArray[np.float32]
+    means: Float32s
+    opacities: Float32s
     codes: Mapping[str, NDArray[np.integer]] = field(default_factory=dict)
-    codebooks: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    raw: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    codebooks: Mapping[str, Float32s] = field(default_factory=dict)
+    raw: Mapping[str, Float32s] = field(default_factory=dict)
     sh_degree: int = 3
     config: Mapping[str, Any] = field(default_factory=dict)
     metrics: Mapping[str, float | None] = field(default_factory=dict)
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     stored_bytes: int | None = None
-    bases: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    bases: Mapping[str, Float32s] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n, dims = len(self.means), splat.attribute_dims(self.sh_degree)
@@ -115,14 +115,14 @@ class CompressedScene:
         """Whether it is to be rendered with anti-aliasing, as it was trained (``antialiased`` of :attr:`config`)."""
         return self.config.get("antialiased") is True
 
-    def values(self, name: str, rows: slice = slice(None)) -> NDArray[np.float32]:
+    def values(self, name: str, rows: slice = slice(None)) -> Float32s:
         """An attribute ``[N, ...]`` of all splats or some, bit for bit the rows of its codebook if it has one.
 
         Args:
             name: Attribute; positions are relative to ``origin``.
             rows: Which splats.
         """
-        values: NDArray[np.float32]
+        values: Float32s
         if name in self.codes:
             values = self.codebooks[name][self.codes[name][rows]]
         else:
@@ -145,22 +145,20 @@ class CompressedScene:
             *(torch.from_numpy(np.ascontiguousarray(self.values(name))) for name in splat.ATTRIBUTES)
         )
 
-    def table(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.integer] | None]:
+    def table(self, name: str) -> tuple[Float32s, NDArray[np.integer] | None]:
         """Distinct rows ``[K, D]`` of an attribute and the row of each splat ``[N]``; None where row i is splat i's."""
         if name in self.codes:
             return self.codebooks[name], self.codes[name]
         values = self.values(name)
         return values.reshape(len(values), splat.attribute_dims(self.sh_degree)[name]), None
 
-    def uses(self, name: str) -> NDArray[np.int64] | None:
+    def uses(self, name: str) -> Int64s | None:
         """How many splats use each row of :meth:`table` ``[K]``; None where each splat has its own."""
         if name in self.raw:
             return None
         return np.bincount(self.codes[name], minlength=len(self.codebooks[name])).astype(np.int64)
 
-    def spread(
-        self, name: str, function: Callable[[NDArray[np.float32], NDArray[np.int64] | None], NDArray[_T]]
-    ) -> NDArray[_T]:
+    def spread(self, name: str, function: Callable[[Float32s, Int64s | None], NDArray[_T]]) -> NDArray[_T]:
         """A function of the rows of an attribute, for each splat: computed once per row of the codebook.
 
         Args:
@@ -222,14 +220,14 @@ class CompressedScene:
         return self.take(keep)
 
 
-def _check_floats(name: str, array: NDArray[np.float32], shape: tuple[int, ...]) -> None:
+def _check_floats(name: str, array: Float32s, shape: tuple[int, ...]) -> None:
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {list(shape)}, got {list(array.shape)}")
     if array.dtype != np.float32:  # nothing is rounded silently
         raise TypeError(f"{name} must be float32, got {array.dtype}; convert it with .astype(np.float32)")
 
 
-def _check_codes(name: str, codes: NDArray[np.integer], codebook: NDArray[np.float32], n: int, dim: int) -> None:
+def _check_codes(name: str, codes: NDArray[np.integer], codebook: Float32s, n: int, dim: int) -> None:
     if dim == 0:
         raise ValueError(
             f"{name} has no coefficients at SH degree 0, so no codebook; give it in raw with shape [{n}, 0]"
@@ -262,7 +260,7 @@ UP_AXES = {
 }
 
 
-def turn_up(up: NDArray[np.float64], axis: str) -> NDArray[np.float64]:
+def turn_up(up: Float64s, axis: str) -> Float64s:
     """The rotation ``[3, 3]`` that turns a direction to an axis: the shortest way to -y, then around x.
 
     Args:
@@ -282,14 +280,14 @@ def turn_up(up: NDArray[np.float64], axis: str) -> NDArray[np.float64]:
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
-def rotated(scene: CompressedScene, rotation: NDArray[np.float64]) -> CompressedScene:
+def rotated(scene: CompressedScene, rotation: Float64s) -> CompressedScene:
     """The scene turned about the world's origin by a rotation ``[3, 3]``, see :func:`moved`."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
     return moved(scene, matrix)
 
 
-def moved(scene: CompressedScene, matrix: NDArray[np.float64]) -> CompressedScene:
+def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     """The scene turned, scaled and moved.
 
     Positions, scales, rotations and spherical harmonics change, the last three by the rows of their codebooks; numbers
@@ -319,7 +317,7 @@ def moved(scene: CompressedScene, matrix: NDArray[np.float64]) -> CompressedScen
     rotation = linear / size
     harmonics = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
 
-    def rows(tables: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+    def rows(tables: Mapping[str, Float32s]) -> dict[str, Float32s]:
         found = dict(tables)
         if "scales" in found and size != 1:
             found["scales"] = (found["scales"] + np.log(size)).astype(np.float32)
@@ -349,7 +347,7 @@ def placed(scene: CompressedScene, frame: "Frame") -> CompressedScene:
     if frame.unit == 1 and not any(frame.middle):
         return replace(scene, origin=frame.origin)
 
-    def rows(tables: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+    def rows(tables: Mapping[str, Float32s]) -> dict[str, Float32s]:
         longer = np.log(frame.unit)
         return {name: (rows + longer).astype(np.float32) if name == "scales" else rows for name, rows in tables.items()}
 
@@ -418,7 +416,7 @@ def joined(scenes: Sequence[CompressedScene]) -> CompressedScene:
     )
 
 
-def cropped(scene: CompressedScene, low: NDArray[np.float64], high: NDArray[np.float64]) -> CompressedScene:
+def cropped(scene: CompressedScene, low: Float64s, high: Float64s) -> CompressedScene:
     """The splats whose centres are in a box, its sides included; codebooks stay as they are.
 
     Args:

@@ -1,11 +1,11 @@
 """What a scene file holds, and how far what is read is from what was written."""
 
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import format_of, read_scene, suffix_of
 from nsvq_lightning.io.nsvq.header import describe_nsvq
@@ -41,7 +41,7 @@ def attribute_errors(read: CompressedScene, written: CompressedScene) -> dict[st
     return {name: float(np.sqrt(np.mean(np.square(error)))) if error.size else 0.0 for name, error in errors.items()}
 
 
-def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
+def describe(path: StrPath) -> dict[str, Any]:
     """Facts about a file, as JSON values.
 
     Raises:

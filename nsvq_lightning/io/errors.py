@@ -7,7 +7,9 @@ takes 16 bits or more of a splat, and a whole splat 5 bytes or more in every for
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from os import PathLike, fspath
+from os import fspath
+
+from nsvq_lightning.io.atomic import StrPath
 
 
 class FormatError(ValueError):
@@ -30,7 +32,7 @@ class FormatError(ValueError):
 
 
 @contextmanager
-def naming_file(path: str | PathLike[str]) -> Iterator[None]:
+def naming_file(path: StrPath) -> Iterator[None]:
     """Prefix every :class:`FormatError` of the block with the file's name, so that parsers need not know it."""
     try:
         yield

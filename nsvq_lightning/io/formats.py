@@ -1,7 +1,6 @@
 """Load and save scenes of any format: the end of the file's name selects it."""
 
 import logging
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nsvq_lightning.io import glb, lod, ply, sog, splat, spz, usda
+from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.io.compressed import CompressedScene, in_morton_order
 from nsvq_lightning.io.errors import naming_file
 from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_nsvq
@@ -42,7 +42,7 @@ class Format:
     in_order: Callable[[CompressedScene], CompressedScene] | None = None
 
 
-def load(path: str | os.PathLike[str]) -> "Splats":
+def load(path: StrPath) -> "Splats":
     """Load a scene of any supported format; splats with NaN or infinite values are left out with a warning.
 
     Args:
@@ -61,7 +61,7 @@ def load(path: str | os.PathLike[str]) -> "Splats":
     return scene.decode()
 
 
-def read_scene(path: str | os.PathLike[str]) -> CompressedScene:
+def read_scene(path: StrPath) -> CompressedScene:
     """Read a scene of any supported format, keeping its codebooks; arguments and errors are those of :func:`load`."""
     path = Path(path)
     scene = format_of(path).read(path)
@@ -74,7 +74,7 @@ def read_scene(path: str | os.PathLike[str]) -> CompressedScene:
 
 def save(
     scene: "SplatTensors | CompressedScene",
-    path: str | os.PathLike[str],
+    path: StrPath,
     storage: Storage | None = None,
     **options: Any,
 ) -> int:
@@ -115,13 +115,13 @@ def save(
     return entry.write(path, scene, **options)
 
 
-def suffix_of(path: str | os.PathLike[str]) -> str:
+def suffix_of(path: StrPath) -> str:
     """The longest end of a file's name, in lower case, that is a key of :data:`FORMATS`; empty if none is."""
     name = Path(path).name.lower()
     return max((suffix for suffix in FORMATS if name.endswith(suffix)), key=len, default="")
 
 
-def format_of(path: str | os.PathLike[str]) -> Format:
+def format_of(path: StrPath) -> Format:
     """The format that the name of a file selects.
 
     Raises:

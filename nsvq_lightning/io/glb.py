@@ -7,7 +7,6 @@ colours for each spherical harmonic. glTF has y up: our right, down, front turne
 
 import json
 import logging
-import os
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import HALF_TURN, CompressedScene, joined, moved, rotated
 from nsvq_lightning.io.errors import FormatError, check_room, naming_file, wrong_start
 from nsvq_lightning.io.numbers import FLAT, logits_of, logs_of_lengths, opacity_of
-from nsvq_lightning.splats.conventions import SH_C0, sh_coefficients, unit
+from nsvq_lightning.splats.conventions import SH_C0, Float32s, Float64s, sh_coefficients, unit
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +41,7 @@ _COMPONENTS = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
-def write_glb(path: str | os.PathLike[str], scene: CompressedScene) -> int:
+def write_glb(path: StrPath, scene: CompressedScene) -> int:
     """Write a scene as ``.glb``, in float32.
 
     Returns:
@@ -103,7 +102,7 @@ def write_glb(path: str | os.PathLike[str], scene: CompressedScene) -> int:
     return total
 
 
-def read_glb(path: str | os.PathLike[str]) -> CompressedScene:
+def read_glb(path: StrPath) -> CompressedScene:
     """Read all splats of the scene of a ``.glb`` file, where its nodes put them.
 
     Raises:
@@ -153,7 +152,7 @@ def _parsed(data: bytes) -> tuple[dict[str, Any], memoryview]:
     return document, memoryview(data)[start + length + _CHUNK.size :]
 
 
-def _primitives(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
+def _primitives(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Float64s]]:
     """Those with splats, and the matrix ``[4, 4]`` of the node that each is in."""
     nodes = document["nodes"]
     stack = [(number, np.eye(4)) for number in reversed(document["scenes"][document.get("scene", 0)]["nodes"])]
@@ -170,7 +169,7 @@ def _primitives(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], NDAr
                 yield primitive, matrix
 
 
-def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
+def _matrix(node: dict[str, Any]) -> Float64s:
     """What a node does to what is in it ``[4, 4]``."""
     from scipy.spatial.transform import Rotation
 
@@ -195,7 +194,7 @@ def _splats(document: dict[str, Any], data: memoryview, primitive: dict[str, Any
     if len(names) > len(given):
         log.warning("attributes have the names of a draft of %s, such as _ROTATION", EXTENSION)
 
-    def values(name: str) -> NDArray[np.float32]:
+    def values(name: str) -> Float32s:
         if name not in names:
             raise FormatError(f"splats without the attribute {name}")
         return _accessor(document, data, names[name])
@@ -214,7 +213,7 @@ def _splats(document: dict[str, Any], data: memoryview, primitive: dict[str, Any
     return CompressedScene(means, logits_of(opacities), raw=raw, sh_degree=degree)
 
 
-def _logs_of_scale(scale: NDArray[np.float32]) -> NDArray[np.float32]:
+def _logs_of_scale(scale: Float32s) -> Float32s:
     """Logarithms ``[N, 3]`` of what SCALE holds: lengths, or, until the middle of 2026, their logarithms."""
     if not (scale < 0).any():
         return logs_of_lengths(scale)
@@ -223,7 +222,7 @@ def _logs_of_scale(scale: NDArray[np.float32]) -> NDArray[np.float32]:
     return scale
 
 
-def _accessor(document: dict[str, Any], data: memoryview, number: int) -> NDArray[np.float32]:
+def _accessor(document: dict[str, Any], data: memoryview, number: int) -> Float32s:
     """Rows ``[N, D]`` of an accessor."""
     accessor = document["accessors"][number]
     view = document["bufferViews"][accessor["bufferView"]]

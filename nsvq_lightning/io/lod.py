@@ -7,7 +7,6 @@ one level, each in Morton order.
 
 import itertools
 import json
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -19,17 +18,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.atomic import atomic_write, write_text
+from nsvq_lightning.io.atomic import StrPath, atomic_write, write_text
 from nsvq_lightning.io.compressed import CompressedScene, joined
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.sog import META, PALETTE_LIMIT, read_sog, sog_contents
-from nsvq_lightning.splats.conventions import unit
+from nsvq_lightning.splats.conventions import Float64s, unit
 
 NAME = "lod-meta.json"
 
 
 def write_lod(
-    path: str | os.PathLike[str],
+    path: StrPath,
     scene: CompressedScene,
     *,
     coarser: Sequence[CompressedScene] = (),
@@ -131,7 +130,7 @@ def _tree(levels: Sequence[CompressedScene]) -> tuple[_Node, list[tuple[_Rows, _
 _REACH = 3.0
 
 
-def _boxes(scene: CompressedScene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _boxes(scene: CompressedScene) -> tuple[Float64s, Float64s]:
     """Smallest and largest coordinates ``[N, 3]`` of the ellipsoid of each splat."""
     from scipy.spatial.transform import Rotation
 
@@ -194,7 +193,7 @@ def _is_beside(name: PurePosixPath) -> bool:
     return not name.is_absolute() and ".." not in name.parts and (name.name == META or name.suffix == ".sog")
 
 
-def read_lod(path: str | os.PathLike[str]) -> CompressedScene:
+def read_lod(path: StrPath) -> CompressedScene:
     """Read the finest level of a streamed SOG, and its environment.
 
     Raises:

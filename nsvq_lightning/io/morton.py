@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import INT64, UINT64, check_array, outside
 from nsvq_lightning.io.numbers import power_above, power_below
+from nsvq_lightning.splats.conventions import Float32s, Float64s, Int32s, Int64s, Uint64s
 
 # Bits per coordinate: three coordinates make a key of 63 bits.
 AXIS_BITS = 21
@@ -30,7 +31,7 @@ class Grid:
     base: tuple[int, int, int]
 
     @classmethod
-    def around(cls, means: NDArray[np.float32], widest: NDArray[np.float64]) -> Self:
+    def around(cls, means: Float32s, widest: Float64s) -> Self:
         """The grid for positions ``[N, 3]`` whose cells may be at most ``widest [N]`` wide.
 
         Its cells are small enough for all but the smallest thousandth of splats, yet not below 2⁻²⁰ of the extent of
@@ -47,25 +48,25 @@ class Grid:
         first = np.rint(((low + high) / 2 / step - 2 * quarter) / quarter)
         return cls(step, tuple(int(cell) * quarter for cell in first))  # type: ignore[arg-type]
 
-    def cells(self, means: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def cells(self, means: Float32s) -> tuple[Int64s, NDArray[np.bool_]]:
         """Cell of each position ``[N, 3]``, 0 for those outside; and which ``[N]`` are inside."""
         cells = np.floor(means.astype(np.float64) / self.step) - np.array(self.base, np.float64)
         inside = np.logical_and.reduce((cells >= 0) & (cells < 1 << AXIS_BITS), axis=1)
         return np.where(inside[:, None], cells, 0).astype(np.int64), inside
 
-    def depths(self, doublings: NDArray[np.float64]) -> NDArray[np.int64]:
+    def depths(self, doublings: Float64s) -> Int64s:
         """Bits per axis ``[N]``, 0 to 21, of cells that are at most 2 to the power of ``doublings [N]`` steps wide."""
         return AXIS_BITS - np.clip(np.floor(doublings), 0, AXIS_BITS).astype(np.int64)
 
-    def centers(self, cells: NDArray[np.int64], depths: NDArray[np.int64]) -> NDArray[np.float32]:
+    def centers(self, cells: Int64s, depths: Int64s) -> Float32s:
         """Centre of the cell of ``depths [N]`` bits that holds each cell ``[N, 3]``, scene units."""
         shift = (AXIS_BITS - depths)[:, None]
         middle = (cells >> shift << shift) + 0.5 * (np.int64(1) << shift) + np.array(self.base, np.float64)
-        centers: NDArray[np.float32] = (middle * self.step).astype(np.float32)
+        centers: Float32s = (middle * self.step).astype(np.float32)
         return centers
 
 
-def morton_keys(cells: NDArray[np.int64], depths: NDArray[np.int64]) -> NDArray[np.uint64]:
+def morton_keys(cells: Int64s, depths: Int64s) -> Uint64s:
     """Interleaved bits of coordinates ``[N, 3]``, highest first, x before y before z; those below ``depths`` are 0.
 
     Raises:
@@ -81,7 +82,7 @@ def morton_keys(cells: NDArray[np.int64], depths: NDArray[np.int64]) -> NDArray[
     return keys
 
 
-def unmorton(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
+def unmorton(keys: Uint64s) -> Int64s:
     """Coordinates ``[N, 3]`` of keys ``[N]``.
 
     Raises:
@@ -129,7 +130,7 @@ def _separate(keys, cells):  # type: ignore[no-untyped-def]
             cells[i, axis] = bits
 
 
-def nearest_before(cells: NDArray[np.int64]) -> NDArray[np.int32]:
+def nearest_before(cells: Int64s) -> Int32s:
     """The two nearest ``[N, 2]`` of the 16 rows before each row of ``cells [N, 3]``, nearest first; -1 where none is.
 
     Distances are integers, and the earlier of two equally near rows is taken: every machine finds the same rows.
@@ -182,7 +183,7 @@ def _row(i, place):  # type: ignore[no-untyped-def]
     return i - (_WINDOW - np.int64(place) % _WINDOW) if place < _NONE else -1
 
 
-def spatial_order(means: NDArray[np.float32]) -> NDArray[np.intp]:
+def spatial_order(means: Float32s) -> NDArray[np.intp]:
     """Indices ``[N]`` of splats in Morton order of their positions ``[N, 3]``; equal ones keep their order."""
     cells, _ = Grid.around(means, np.zeros(len(means))).cells(means)
     return morton_keys(cells, np.full(len(means), AXIS_BITS)).argsort(kind="stable")

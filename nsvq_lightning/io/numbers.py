@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nsvq_lightning.io.atomic import StrPath
+from nsvq_lightning.splats.conventions import Float32s, Float64s, Int32s, Uint8s
 
-def opacity_of(logits: NDArray[np.float32]) -> NDArray[np.float64]:
+
+def opacity_of(logits: Float32s) -> Float64s:
     """Opacities in [0, 1] of logits of any shape."""
-    opacities: NDArray[np.float64] = 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
+    opacities: Float64s = 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
     return opacities
 
 
@@ -19,19 +22,19 @@ def opacity_of(logits: NDArray[np.float32]) -> NDArray[np.float64]:
 _OPAQUE = 20.0
 
 
-def finite_logits(logits: NDArray[np.float32]) -> NDArray[np.float32]:
+def finite_logits(logits: Float32s) -> Float32s:
     """The logits with ±20 in place of ±inf, which 0 and 255 become where opacities are stored as bytes."""
     return np.where(np.isinf(logits), np.copysign(np.float32(_OPAQUE), logits), logits)
 
 
-def logits_of(opacities: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+def logits_of(opacities: NDArray[np.floating[Any]]) -> Float32s:
     """Logits of opacities of any shape: finite in [0, 1], otherwise NaN."""
     wide = opacities.astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         return finite_logits((np.log(wide) - np.log1p(-wide)).astype(np.float32))
 
 
-def logits_of_bytes(levels: NDArray[np.uint8]) -> NDArray[np.float32]:
+def logits_of_bytes(levels: Uint8s) -> Float32s:
     """Finite logits of opacities given in 255ths."""
     return logits_of(np.arange(256) / 255)[levels]
 
@@ -41,9 +44,9 @@ def logits_of_bytes(levels: NDArray[np.uint8]) -> NDArray[np.float32]:
 FLAT = -20.0
 
 
-def logs_of_lengths(lengths: NDArray[np.float32]) -> NDArray[np.float32]:
+def logs_of_lengths(lengths: Float32s) -> Float32s:
     """Logarithms of axis lengths of any shape, :data:`FLAT` where there is no length; NaN and infinite ones stay."""
-    logs: NDArray[np.float32] = np.log(lengths.clip(np.finfo(np.float32).tiny))
+    logs: Float32s = np.log(lengths.clip(np.finfo(np.float32).tiny))
     logs[lengths <= 0] = FLAT
     return logs
 
@@ -62,7 +65,7 @@ class Clamped:
 
     def nearest(
         self, name: str, values: NDArray[np.floating], ends: tuple[int, int], uses: NDArray[np.integer] | None = None
-    ) -> NDArray[np.int32]:
+    ) -> Int32s:
         """The nearest integers that the format has.
 
         Args:
@@ -76,12 +79,12 @@ class Clamped:
         """
         rounded = np.clip(np.rint(values), *ends)
         self._count(name, np.abs(rounded - values) > 0.5 + _ROUNDING, uses)
-        integers: NDArray[np.int32] = np.nan_to_num(rounded).astype(np.int32)
+        integers: Int32s = np.nan_to_num(rounded).astype(np.int32)
         return integers
 
     def within(
-        self, name: str, values: NDArray[np.float32], low: float, high: float, uses: NDArray[np.integer] | None = None
-    ) -> NDArray[np.float32]:
+        self, name: str, values: Float32s, low: float, high: float, uses: NDArray[np.integer] | None = None
+    ) -> Float32s:
         """Values ``[K, ...]`` clamped to [``low``, ``high``]; the other arguments are those of :meth:`nearest`."""
         self._count(name, (values < low) | (values > high), uses)
         return np.clip(values, low, high)
@@ -90,7 +93,7 @@ class Clamped:
         rows = np.asarray(beyond).any(tuple(range(1, np.ndim(beyond))))
         self._counts[name] = self._counts.get(name, 0) + int(rows.sum() if uses is None else uses[rows].sum())
 
-    def warn(self, path: str | os.PathLike[str], count: int) -> None:
+    def warn(self, path: StrPath, count: int) -> None:
         """Warn how many of ``count`` splats were clamped to the format's range."""
         changed = ", ".join(f"{name} {splats}" for name, splats in self._counts.items() if splats)
         if changed:
@@ -115,7 +118,7 @@ def nearest_power(value: float) -> float:
     return below if value / below <= math.sqrt(2.0) else 2 * below
 
 
-def coarsest_power(values: NDArray[np.float32]) -> float:
+def coarsest_power(values: Float32s) -> float:
     """The largest power of two of which all ``values`` are integer multiples, 0 if all are 0; they must be finite."""
     mantissas, exponents = np.frexp(values[values != 0])
     if not mantissas.size:

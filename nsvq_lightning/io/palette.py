@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 from nsvq_lightning.compute.jit import kernel
 from nsvq_lightning.compute.memory import check_array, check_table
 from nsvq_lightning.io.scalar_kmeans import split
+from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s
 
 
-def find_palette(
-    rows: NDArray[np.float32], weight: NDArray[np.number[Any]], count: int
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+def find_palette(rows: Float32s, weight: NDArray[np.number[Any]], count: int) -> tuple[Float32s, Int64s]:
     """Few rows that represent many with a small weighted squared distance; the rows themselves if they are few enough.
 
     All rows start as one cell, which is cut across the direction in which they differ most, where that reduces the sum
@@ -43,9 +42,7 @@ def find_palette(
     return np.stack([total / mass for total in sums], axis=1).astype(np.float32), labels
 
 
-def in_order_of_use(
-    rows: NDArray[np.float32], labels: NDArray[np.integer]
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+def in_order_of_use(rows: Float32s, labels: NDArray[np.integer]) -> tuple[Float32s, Int64s]:
     """The distinct rows in use, in order of first use by the splats, and the row of each splat.
 
     Neighbours then have similar labels. If each splat has its own row, labels count up and cost next to nothing.
@@ -65,7 +62,7 @@ def in_order_of_use(
 class _Cells:
     """Runs of ``order [N]``, the indices of the rows; each run is a cell."""
 
-    def __init__(self, rows: NDArray[np.float32], weight: NDArray[np.float64]) -> None:
+    def __init__(self, rows: Float32s, weight: Float64s) -> None:
         self._rows, self._weight = rows, weight
         self.order = np.arange(len(rows))
 

@@ -11,12 +11,21 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene, in_morton_order
 from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
 from nsvq_lightning.io.numbers import FLAT, finite_logits, logits_of_bytes, opacity_of
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
-from nsvq_lightning.splats.conventions import SH_C0, from_smallest_three, shN_degree, smallest_three, unit
+from nsvq_lightning.splats.conventions import (
+    SH_C0,
+    Float32s,
+    Float64s,
+    Uint32s,
+    from_smallest_three,
+    shN_degree,
+    smallest_three,
+    unit,
+)
 
 
 @dataclass(frozen=True)
@@ -57,7 +66,7 @@ class PlyHeader:
         return self.dtype.names or ()
 
 
-def read_ply_header(path: str | os.PathLike[str]) -> PlyHeader:
+def read_ply_header(path: StrPath) -> PlyHeader:
     """Header of a ``.ply`` file that is long enough for its vertices.
 
     Raises:
@@ -212,7 +221,7 @@ def _needed(header: PlyHeader, sh_degree: int) -> dict[str, list[str]]:
     return columns
 
 
-def _coefficients(colors: NDArray[np.float32], is_float: bool) -> NDArray[np.float32]:
+def _coefficients(colors: Float32s, is_float: bool) -> Float32s:
     """SH coefficients of colours: floats to 1, or whole numbers to 255 or 65535, as the numbers themselves tell."""
     full = 255 if colors.max(initial=0) <= 255 else 65535
     if is_float and len(colors) and np.quantile(colors, 0.9) <= 1:
@@ -238,7 +247,7 @@ def _check_packed(header: PlyHeader) -> None:
         )
 
 
-def read_ply(path: str | os.PathLike[str]) -> CompressedScene:
+def read_ply(path: StrPath) -> CompressedScene:
     """Read the splats of a ``.ply`` file.
 
     Properties may come in any order and any number type, binary (either byte order) or ascii; with or without normals.
@@ -259,7 +268,7 @@ def read_ply(path: str | os.PathLike[str]) -> CompressedScene:
     return CompressedScene(means, opacities, raw=raw, sh_degree=sh_degree, config=config)
 
 
-def _read_plain(path: str | os.PathLike[str], header: PlyHeader, sh_degree: int) -> dict[str, NDArray[np.float32]]:
+def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, Float32s]:
     """Rows ``[N, D]`` of each attribute."""
     columns = _needed(header, sh_degree)
     # A third scale that is not there stays flat.
@@ -278,13 +287,13 @@ def _read_plain(path: str | os.PathLike[str], header: PlyHeader, sh_degree: int)
     return raw | {"opacities": finite_logits(raw["opacities"])}
 
 
-def _by_coefficient(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+def _by_coefficient(rows: Float32s) -> Float32s:
     """Higher coefficients ``[N, D]``, all of red first, in our order: the three colours of each coefficient."""
     return rows.reshape(len(rows), 3, rows.shape[1] // 3).swapaxes(1, 2).reshape(rows.shape)
 
 
 def read_ply_columns(
-    path: str | os.PathLike[str], header: PlyHeader, names: Sequence[str], dtype: type[Any] = np.float32
+    path: StrPath, header: PlyHeader, names: Sequence[str], dtype: type[Any] = np.float32
 ) -> Iterator[NDArray[Any]]:
     """Tables ``[rows, len(names)]`` of some properties of the vertices of a ``.ply`` file, which follow each other.
 
@@ -308,7 +317,7 @@ def read_ply_columns(
             yield np.stack([table[name] for name in names], axis=1, dtype=dtype, casting="unsafe")
 
 
-def _read_ascii(file: BinaryIO, header: PlyHeader) -> NDArray[np.float64]:
+def _read_ascii(file: BinaryIO, header: PlyHeader) -> Float64s:
     shape = header.count, len(header.properties)
     if header.count == 0:
         return np.empty(shape)
@@ -321,13 +330,13 @@ def _read_ascii(file: BinaryIO, header: PlyHeader) -> NDArray[np.float64]:
     return table
 
 
-def _read_packed(path: str | os.PathLike[str], header: PlyHeader, sh_degree: int) -> dict[str, NDArray[np.float32]]:
+def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, Float32s]:
     """Rows ``[N, D]`` of each attribute of a compressed ``.ply``; 256 that follow each other share a row of bounds."""
     chunks, vertices = (
         np.fromfile(path, table.dtype, table.count, offset=table.offset) for table in (header.others["chunk"], header)
     )
 
-    def within(parts: NDArray[np.float64], names: Sequence[str]) -> NDArray[np.float64]:
+    def within(parts: Float64s, names: Sequence[str]) -> Float64s:
         """Shares of the ways from the smallest to the largest values of the chunk, ``[N, 3]``."""
         ends = (np.stack([chunks[f"{end}_{name}"] for name in names], 1, dtype=np.float64) for end in ("min", "max"))
         low, high = (np.repeat(end, 256, axis=0)[: header.count] for end in ends)
@@ -354,7 +363,7 @@ def _read_packed(path: str | os.PathLike[str], header: PlyHeader, sh_degree: int
     }
 
 
-def _parts(words: NDArray[np.uint32], *bits: int) -> NDArray[np.float64]:
+def _parts(words: Uint32s, *bits: int) -> Float64s:
     """Numbers of so many bits, the last one in the lowest, as shares of the largest ``[N, len(bits)]``."""
     shifts = np.cumsum((0, *bits[:0:-1]))[::-1]
     shares = [(words >> shift) % (1 << size) / ((1 << size) - 1) for size, shift in zip(bits, shifts, strict=True)]
@@ -367,7 +376,7 @@ _UNUSED = [] if any("nx" in attribute.ply.split() for attribute in ATTRIBUTES.va
 _ORDER = tuple(dict.fromkeys(("means", "unused", "sh0", "shN", "opacities", "scales", "quats", *ATTRIBUTES)))
 
 
-def write_ply(path: str | os.PathLike[str], scene: CompressedScene) -> int:
+def write_ply(path: StrPath, scene: CompressedScene) -> int:
     """Write splats as little-endian ``.ply``, 62 float32 per splat at SH degree 3.
 
     Args:
@@ -390,7 +399,7 @@ def write_ply(path: str | os.PathLike[str], scene: CompressedScene) -> int:
         return file.tell()
 
 
-def write_compressed_ply(path: str | os.PathLike[str], scene: CompressedScene) -> int:
+def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
     """Write splats as compressed ``.ply``, 16 bytes each and a byte for each SH coefficient, in Morton order.
 
     Returns:
@@ -400,7 +409,7 @@ def write_compressed_ply(path: str | os.PathLike[str], scene: CompressedScene) -
     starts = np.arange(0, len(scene), 256)
     bounds: dict[str, NDArray[Any]] = {}
 
-    def shares(values: NDArray[np.float32], names: Sequence[str]) -> NDArray[np.float64]:
+    def shares(values: Float32s, names: Sequence[str]) -> Float64s:
         """Shares of the ways from the smallest to the largest values of 256 splats ``[N, 3]``."""
         low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
         for end, values_of_end in (("min", low), ("max", high)):
@@ -435,7 +444,7 @@ def write_compressed_ply(path: str | os.PathLike[str], scene: CompressedScene) -
     return write_elements(path, elements, _comments(scene.antialiased))
 
 
-def write_elements(path: str | os.PathLike[str], elements: Mapping[str, NDArray[np.void]], comments: str = "") -> int:
+def write_elements(path: StrPath, elements: Mapping[str, NDArray[np.void]], comments: str = "") -> int:
     """Write tables as little-endian ``.ply``.
 
     Args:
@@ -458,7 +467,7 @@ def write_elements(path: str | os.PathLike[str], elements: Mapping[str, NDArray[
         return file.tell()
 
 
-def _packed(shares: NDArray[np.float64], *bits: int) -> NDArray[np.uint32]:
+def _packed(shares: Float64s, *bits: int) -> Uint32s:
     """Words ``[N]`` of shares ``[N, len(bits)]``, the last one in the lowest bits, as :func:`_parts` takes them."""
     words = np.zeros(len(shares), np.uint32)
     for share, size in zip(shares.T, bits, strict=True):

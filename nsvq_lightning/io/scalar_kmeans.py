@@ -6,6 +6,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from nsvq_lightning.splats.conventions import Float32s, Float64s, Uint8s
+
 
 def split(best_cut: Callable[[int, int], tuple[float, int]], size: int, count: int) -> list[tuple[int, int]]:
     """Start and end of cells of ``size`` numbers: of one cell of all, always the one that gains most is cut in two.
@@ -25,9 +27,7 @@ def split(best_cut: Callable[[int, int], tuple[float, int]], size: int, count: i
     return [(start, end) for _, start, _, end in heap]
 
 
-def scalar_kmeans(
-    values: NDArray[np.float32], weight: NDArray[np.integer] | None = None, count: int = 256
-) -> NDArray[np.float32]:
+def scalar_kmeans(values: Float32s, weight: NDArray[np.integer] | None = None, count: int = 256) -> Float32s:
     """Levels ``[count]``, ascending, that nearly minimize the mean squared distance of values to their nearest level.
 
     If there are no more distinct values than levels, the levels are those values. Otherwise one cell of all values is
@@ -58,24 +58,24 @@ def scalar_kmeans(
     return levels.astype(np.float32)
 
 
-def nearest_level(values: NDArray[np.float32], levels: NDArray[np.float32]) -> NDArray[np.uint8]:
+def nearest_level(values: Float32s, levels: Float32s) -> Uint8s:
     """Index of the level nearest to each value; ``levels`` ascending, at most 256."""
     return np.searchsorted(_borders(levels.astype(np.float64)), values).astype(np.uint8)
 
 
-def _borders(levels: NDArray[np.float64]) -> NDArray[np.float64]:
+def _borders(levels: Float64s) -> Float64s:
     return (levels[1:] + levels[:-1]) / 2
 
 
 class _Cells:
     """Sums over runs of sorted values, each a cell with one level: its mean."""
 
-    def __init__(self, numbers: NDArray[np.float64], mass: NDArray[np.float64]) -> None:
+    def __init__(self, numbers: Float64s, mass: Float64s) -> None:
         self._middle = float(np.average(numbers, weights=mass))  # sums of differences from it lose no digits
         self._mass = np.concatenate([[0.0], np.cumsum(mass)])
         self._sum = np.concatenate([[0.0], np.cumsum(mass * (numbers - self._middle))])
 
-    def means(self, ends: NDArray[np.intp], empty: NDArray[np.float64]) -> NDArray[np.float64]:
+    def means(self, ends: NDArray[np.intp], empty: Float64s) -> Float64s:
         """Means ``[C]`` of the cells between ``ends [C + 1]``; for a cell without values, that of ``empty [C]``."""
         mass = np.diff(self._mass[ends])
         return np.where(mass > 0, np.diff(self._sum[ends]) / np.where(mass > 0, mass, 1) + self._middle, empty)

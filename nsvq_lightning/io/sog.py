@@ -23,7 +23,6 @@ import io
 import json
 import logging
 import math
-import os
 import struct
 import zipfile
 import zlib
@@ -35,12 +34,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene, in_morton_order
 from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, check_room, naming_file, wrong_start
 from nsvq_lightning.io.numbers import logits_of_bytes, opacity_of
 from nsvq_lightning.io.scalar_kmeans import nearest_level, scalar_kmeans
-from nsvq_lightning.splats.conventions import from_smallest_three, sh_coefficients, smallest_three, unit
+from nsvq_lightning.splats.conventions import (
+    Float32s,
+    Float64s,
+    Int64s,
+    Uint8s,
+    from_smallest_three,
+    sh_coefficients,
+    smallest_three,
+    unit,
+)
 
 log = logging.getLogger(__name__)
 
@@ -114,7 +122,7 @@ def sog_contents(scene: CompressedScene, palette: int = PALETTE_LIMIT) -> dict[s
     return contents
 
 
-def write_sog(path: str | os.PathLike[str], scene: CompressedScene, *, palette: int = PALETTE_LIMIT) -> int:
+def write_sog(path: StrPath, scene: CompressedScene, *, palette: int = PALETTE_LIMIT) -> int:
     """Write a scene as ``.sog``, in Morton order.
 
     Args:
@@ -207,7 +215,7 @@ class _Archive:
             raise FormatError(f"damaged: {name!r} in {META} must be an integer in {low}..{high}, got {str(value)[:40]}")
         return value
 
-    def _numbers(self, attribute: str, name: str, count: range, largest: float) -> NDArray[np.float64]:
+    def _numbers(self, attribute: str, name: str, count: range, largest: float) -> Float64s:
         values = self._entry(attribute).get(name)
         values = [np.nan if value is None else value for value in (values if isinstance(values, list) else [values])]
         if len(values) not in count:
@@ -216,7 +224,7 @@ class _Archive:
             raise FormatError(f"damaged: {name!r} in {META} must hold numbers of at most {largest:.4g}")
         return np.array(values, np.float64)
 
-    def texels(self, attribute: str, number: int = 0, count: int | None = None) -> NDArray[np.uint8]:
+    def texels(self, attribute: str, number: int = 0, count: int | None = None) -> Uint8s:
         """The first ``count`` texels ``[count, 4]`` of one of the pictures of an attribute; one a splat if None."""
         picture, count = self._picture(attribute, number), self.count if count is None else count
         height, width = picture.shape[:2]
@@ -224,7 +232,7 @@ class _Archive:
             raise FormatError(f"damaged: a picture of {attribute} has {width} x {height} texels, {count} are needed")
         return picture.reshape(-1, 4)[:count]
 
-    def _picture(self, attribute: str, number: int) -> NDArray[np.uint8]:
+    def _picture(self, attribute: str, number: int) -> Uint8s:
         """One of the pictures of an attribute ``[H, W, 4]``."""
         from PIL import Image
 
@@ -243,7 +251,7 @@ class _Archive:
         except Exception as error:  # damage can make Pillow's decoders raise anything
             raise FormatError(f"damaged: {name} is not a picture ({error})") from None
 
-    def values(self, attribute: str, texels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def values(self, attribute: str, texels: Uint8s) -> Float32s:
         """The values ``[N, C]`` of an attribute that texels ``[N, C]`` have the level indices of."""
         if self.version == 1:
             ends = 1 if attribute == "shN" else texels.shape[1]
@@ -254,7 +262,7 @@ class _Archive:
             raise FormatError(f"damaged: level {texels.max()} of {attribute}, there are {len(levels)}")
         return levels.astype(np.float32)[texels]
 
-    def _levels(self, attribute: str) -> NDArray[np.float64]:
+    def _levels(self, attribute: str) -> Float64s:
         """The codebook of an attribute; levels that are null, as older writers left NaN, in line with the others."""
         levels = self._numbers(attribute, "codebook", range(1, _LEVELS + 1), _LARGEST)
         known = np.flatnonzero(np.isfinite(levels))
@@ -267,7 +275,7 @@ class _Archive:
         log.warning("%d levels of %s are null: taken in line with those beside", len(levels) - len(known), attribute)
         return np.asarray(make_interp_spline(known, levels[known], k=1)(np.arange(len(levels))))
 
-    def colors(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def colors(self) -> tuple[Float32s, Float32s]:
         """Constant coefficients ``[N, 3]`` and opacity logits ``[N]``."""
         texels = self.texels("sh0")
         if self.version == 1:
@@ -275,7 +283,7 @@ class _Archive:
             return values[:, :3], values[:, 3]
         return self.values("sh0", texels[:, :3]), logits_of_bytes(texels[:, 3])
 
-    def means(self) -> NDArray[np.float32]:
+    def means(self) -> Float32s:
         """Positions ``[N, 3]``."""
         mins, maxs = (self._numbers("means", name, range(3, 4), math.log1p(_LARGEST)) for name in ("mins", "maxs"))
         low, high = (self.texels("means", number)[:, :3] for number in range(2))
@@ -283,7 +291,7 @@ class _Archive:
         # The logarithm of the largest float32 may round up, beyond it.
         return np.clip(np.copysign(np.expm1(np.abs(logs)), logs), -3.4e38, 3.4e38).astype(np.float32)
 
-    def quats(self) -> NDArray[np.float32]:
+    def quats(self) -> Float32s:
         """Rotations ``[N, 4]``; NaN where the mark is none."""
         texels = self.texels("quats")
         marked = texels[:, 3] >= 252
@@ -296,7 +304,7 @@ class _Archive:
         quats[~marked] = np.nan
         return quats
 
-    def palette(self) -> tuple[NDArray[np.float32], NDArray[np.uint16]]:
+    def palette(self) -> tuple[Float32s, NDArray[np.uint16]]:
         """Palette of the spherical harmonics ``[K, D]`` and the label of each splat ``[N]``."""
         rows = self._integer(self._entry("shN"), "count", 1, PALETTE_LIMIT)
         coefficients = sh_coefficients(self.sh_degree)
@@ -309,7 +317,7 @@ class _Archive:
         return palette, labels
 
 
-def _palette(scene: CompressedScene, most: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+def _palette(scene: CompressedScene, most: int) -> tuple[Float32s, Int64s]:
     """Palette of spherical harmonics ``[K, D]`` in order of first use, and the row of each splat ``[N]``."""
     from nsvq_lightning.io.palette import find_palette, in_order_of_use  # imports Numba, which readers do without
 
@@ -325,19 +333,19 @@ def _palette(scene: CompressedScene, most: int) -> tuple[NDArray[np.float32], ND
     return in_order_of_use(rows, labels[codes])
 
 
-def _visibility(scene: CompressedScene) -> NDArray[np.float64]:
+def _visibility(scene: CompressedScene) -> Float64s:
     """How much the colour of each splat matters ``[N]`` when no view is known: opacity times width.
 
     Every splat counts a little, however small it is compared with the largest.
     """
     sizes = scene.spread("scales", lambda rows, _: np.sort(rows, axis=1)[:, 1:].mean(1)).astype(np.float64)
-    weight: NDArray[np.float64] = opacity_of(scene.opacities) * np.exp(sizes - sizes.max())
+    weight: Float64s = opacity_of(scene.opacities) * np.exp(sizes - sizes.max())
     return weight / float(weight.mean()) + 0.01
 
 
 def _packed_means(
-    means: NDArray[np.float32],
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8], dict[str, list[float]]]:
+    means: Float32s,
+) -> tuple[Uint8s, Uint8s, dict[str, list[float]]]:
     wide = means.astype(np.float64)
     logs = np.copysign(np.log1p(np.abs(wide)), wide)
     low, high = (logs.min(0), logs.max(0)) if len(logs) else (np.zeros(3), np.zeros(3))
@@ -350,7 +358,7 @@ def _packed_means(
     )
 
 
-def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _packed_quats(rows: Float32s) -> Uint8s:
     largest, others = smallest_three(unit(rows))
     texels = np.empty((len(rows), 4), np.uint8)
     texels[:, :3] = np.rint(127.5 * (1 + math.sqrt(2) * others).clip(0, 2))
@@ -358,16 +366,14 @@ def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint8]:
     return texels
 
 
-def _leveled(scene: CompressedScene, name: str) -> tuple[NDArray[np.uint8], list[float]]:
+def _leveled(scene: CompressedScene, name: str) -> tuple[Uint8s, list[float]]:
     """Level indices ``[N, D]`` of an attribute, and the levels."""
     uses = scene.uses(name)
     levels = scalar_kmeans(scene.table(name)[0], None if uses is None else uses[:, None], _LEVELS)
     return scene.spread(name, lambda rows, _: nearest_level(rows, levels)), _decimals(levels)
 
 
-def _packed_sh(
-    rows: NDArray[np.float32], labels: NDArray[np.int64], sh_degree: int
-) -> tuple[dict[str, Any], dict[str, NDArray[np.uint8]]]:
+def _packed_sh(rows: Float32s, labels: Int64s, sh_degree: int) -> tuple[dict[str, Any], dict[str, Uint8s]]:
     """What ``meta.json`` says of a palette ``[K, D]`` and labels ``[N]``, and their pictures by name."""
     levels = scalar_kmeans(rows, np.bincount(labels, minlength=len(rows))[:, None], _LEVELS)
     line = _ROWS_A_LINE * sh_coefficients(sh_degree)
@@ -386,12 +392,12 @@ def _packed_sh(
     }
 
 
-def _decimals(levels: NDArray[np.float32]) -> list[float]:
+def _decimals(levels: Float32s) -> list[float]:
     """Levels as the shortest decimals that give the same float32."""
     return [float(str(level)) for level in levels]
 
 
-def _picture(texels: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
+def _picture(texels: Uint8s, shape: tuple[int, int]) -> Uint8s:
     """Texels ``[N, C]`` as a picture ``[H, W, 4]``; missing texels are black and opaque."""
     picture = np.zeros((shape[0] * shape[1], 4), np.uint8)
     picture[:, 3] = 255
@@ -415,7 +421,7 @@ def _archived(path: Path) -> tuple[bytes, int]:
     return buffer.getvalue(), sum(file.stat().st_size for file in (path, *pictures))
 
 
-def read_sog(path: str | os.PathLike[str]) -> CompressedScene:
+def read_sog(path: StrPath) -> CompressedScene:
     """Read a ``.sog`` file or a ``meta.json`` in its folder; the palette becomes the codebook of the harmonics.
 
     Raises:

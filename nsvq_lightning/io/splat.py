@@ -11,24 +11,22 @@ offset     bytes  content
 """
 
 import logging
-import os
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nsvq_lightning.io.atomic import write_bytes
+from nsvq_lightning.io.atomic import StrPath, write_bytes
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, logs_of_lengths, opacity_of
-from nsvq_lightning.splats.conventions import SH_C0, unit
+from nsvq_lightning.splats.conventions import SH_C0, Float32s, Uint8s, unit
 
 logger = logging.getLogger(__name__)
 
 _RECORD = np.dtype([("means", "<f4", 3), ("lengths", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
 
 
-def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
+def write_splat(path: StrPath, scene: CompressedScene) -> int:
     """Write a scene as ``.splat``.
 
     View-dependent colour is lost, colours outside [0, 1] are clamped, and splats with a non-finite value are left out,
@@ -59,15 +57,15 @@ def write_splat(path: str | os.PathLike[str], scene: CompressedScene) -> int:
     return records.nbytes
 
 
-def _packed_quats(quats: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _packed_quats(quats: Float32s) -> Uint8s:
     units = unit(quats)
     # Of q and -q, the one whose largest component is negative: -1 fits a byte, 1 does not.
     largest = np.take_along_axis(units, np.abs(units).argmax(1)[:, None], 1)
-    packed: NDArray[np.uint8] = np.rint(128 + 128 * np.where(largest > 0, -units, units)).astype(np.uint8)
+    packed: Uint8s = np.rint(128 + 128 * np.where(largest > 0, -units, units)).astype(np.uint8)
     return packed
 
 
-def read_splat(path: str | os.PathLike[str]) -> CompressedScene:
+def read_splat(path: StrPath) -> CompressedScene:
     """Read a ``.splat`` file.
 
     Raises:

@@ -29,7 +29,6 @@ extensions, the table, and one Zstandard stream for each array that is not empty
 import gzip
 import logging
 import math
-import os
 import struct
 import zlib
 from collections.abc import Mapping
@@ -42,11 +41,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, in_morton_order, rotated
 from nsvq_lightning.io.errors import FormatError, check_room, naming_file, wrong_start
 from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, opacity_of
 from nsvq_lightning.splats import conventions
+from nsvq_lightning.splats.conventions import Float32s, Int64s, Uint8s, Uint32s
 
 logger = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ _SYSTEMS = (
 _ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 
 
-def _write_frame(path: str | os.PathLike[str], header: SpzHeader, arrays: Mapping[str, NDArray[Any]]) -> int:
+def _write_frame(path: StrPath, header: SpzHeader, arrays: Mapping[str, NDArray[Any]]) -> int:
     """Write header and arrays, by the names of :attr:`SpzHeader.sizes`; returns the bytes of the file."""
     contents = [np.ascontiguousarray(arrays[name]).data.cast("B") for name in header.streams]
     axes = _EXTENSION.pack(_AXES, 4, _SYSTEMS.index(header.axes)) if header.axes else b""
@@ -257,7 +257,7 @@ def _parse(start: bytes, file_bytes: int) -> SpzHeader:
     return SpzHeader(version, count, sh_degree, fraction_bits, flags)
 
 
-def _signs(axes: str, sh_degree: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+def _signs(axes: str, sh_degree: int) -> tuple[Float32s, Float32s, Float32s]:
     """What changes sign between right, down, front and other axes.
 
     Returns:
@@ -292,7 +292,7 @@ DEFAULT_AXES = "rdf"
 
 
 def write_spz(
-    path: str | os.PathLike[str], scene: CompressedScene, *, version: int = DEFAULT_VERSION, axes: str = DEFAULT_AXES
+    path: StrPath, scene: CompressedScene, *, version: int = DEFAULT_VERSION, axes: str = DEFAULT_AXES
 ) -> int:
     """Write a scene as ``.spz``.
 
@@ -353,10 +353,8 @@ def _fraction_bits(scene: CompressedScene) -> int:
     return min(max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0), MOST_FRACTION)
 
 
-def _packed(
-    scene: CompressedScene, name: str, factor: float | NDArray[np.float32], zero: float, clamped: Clamped
-) -> NDArray[np.uint8]:
-    def packed(rows: NDArray[np.float32], uses: NDArray[np.int64] | None) -> NDArray[np.uint8]:
+def _packed(scene: CompressedScene, name: str, factor: float | Float32s, zero: float, clamped: Clamped) -> Uint8s:
+    def packed(rows: Float32s, uses: Int64s | None) -> Uint8s:
         found = np.empty(rows.shape, np.uint8)
         for start in range(0, len(rows), 1 << 16):  # so that temporary arrays stay small
             block = slice(start, start + (1 << 16))
@@ -367,7 +365,7 @@ def _packed(
     return scene.spread(name, packed)
 
 
-def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint32]:
+def _packed_quats(rows: Float32s) -> Uint32s:
     largest, others = conventions.smallest_three(conventions.unit(rows)[:, [1, 2, 3, 0]])
     packed = largest.astype(np.uint32)
     for part in others.T:
@@ -376,7 +374,7 @@ def _packed_quats(rows: NDArray[np.float32]) -> NDArray[np.uint32]:
     return packed.astype("<u4")
 
 
-def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
+def read_spz(path: StrPath) -> CompressedScene:
     """Read a ``.spz`` file of version 1 to 4, with any axes; other extensions are ignored.
 
     Raises:
@@ -416,7 +414,7 @@ def read_spz(path: str | os.PathLike[str]) -> CompressedScene:
     return rotated(scene, UP_AXES["z"]) if turn else scene
 
 
-def _unpacked_means(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.floating[Any]]:
+def _unpacked_means(header: SpzHeader, data: Uint8s) -> NDArray[np.floating[Any]]:
     if header.version == 1:
         return np.ascontiguousarray(data).view("<f2").astype(np.float64)
     # Put three bytes at the top of four, then shift down with the sign.
@@ -426,7 +424,7 @@ def _unpacked_means(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.fl
     return np.ldexp(fixed.astype(np.float64), -header.fraction_bits)
 
 
-def _unpacked_quats(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _unpacked_quats(header: SpzHeader, data: Uint8s) -> Float32s:
     if header.version < 3:
         xyz = data.astype(np.float64) / 127.5 - 1
         xyzw = conventions.from_smallest_three(np.full(header.count, 3), xyz)

@@ -4,18 +4,17 @@ It has y up: our right, down, front turned half around z.
 """
 
 import logging
-import os
 import re
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import HALF_TURN, UP_AXES, CompressedScene, moved, rotated
 from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
 from nsvq_lightning.io.numbers import logits_of, logs_of_lengths, opacity_of
-from nsvq_lightning.splats.conventions import sh_coefficients, shN_degree, unit
+from nsvq_lightning.splats.conventions import Float32s, Float64s, sh_coefficients, shN_degree, unit
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +24,7 @@ PRIM = "ParticleField3DGaussianSplat"
 _COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
 
 
-def write_usda(path: str | os.PathLike[str], scene: CompressedScene) -> int:
+def write_usda(path: StrPath, scene: CompressedScene) -> int:
     """Write a scene as ``.usda``; numbers are the shortest that read back to within float32.
 
     Returns:
@@ -68,7 +67,7 @@ def write_usda(path: str | os.PathLike[str], scene: CompressedScene) -> int:
         return file.tell()
 
 
-def read_usda(path: str | os.PathLike[str]) -> CompressedScene:
+def read_usda(path: StrPath) -> CompressedScene:
     """Read the splats of a ``.usda`` file with one prim of splats, without transforms.
 
     Attributes may be half as precise (``positionsh``), or samples in time, of which the first is read. A stage with z
@@ -104,7 +103,7 @@ def read_usda(path: str | os.PathLike[str]) -> CompressedScene:
             raise FormatError(f"truncated or damaged: {error}") from None
 
 
-def _rows(text: str, name: str, width: int) -> NDArray[np.float32]:
+def _rows(text: str, name: str, width: int) -> Float32s:
     """Rows ``[N, width]`` of an attribute, in full or in half precision."""
     for each in (name, f"{name}h"):
         value = r"(?:=|\.timeSamples\s*=\s*\{[^:\[]*:)\s*\[([^\]]*)\]"
@@ -117,7 +116,7 @@ def _rows(text: str, name: str, width: int) -> NDArray[np.float32]:
     raise FormatError(f"truncated: {name} has no end" if name in text else f"no attribute {name}")
 
 
-def _to_ours(text: str) -> NDArray[np.float64]:
+def _to_ours(text: str) -> Float64s:
     """What takes the axes and the unit of the stage to ours, and to metres where it states a unit ``[4, 4]``."""
     matrix = np.eye(4)
     matrix[:3, :3] = HALF_TURN

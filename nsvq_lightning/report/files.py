@@ -36,6 +36,7 @@ from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import eight_bit, psnr
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.splats.conventions import Uint8s
 from nsvq_lightning.training.resume import ResumedModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
@@ -235,7 +236,7 @@ def comparison(image: Tensor, photo: Tensor, gain: float = 4.0) -> Tensor:
     return torch.cat([photo, image, ((image - photo).abs() * gain).clamp(max=1.0)], dim=1)
 
 
-def as_bytes(image: Tensor) -> NDArray[np.uint8]:
+def as_bytes(image: Tensor) -> Uint8s:
     """An image ``[H, W, 3]`` in [0, 1] with 8 bits."""
     return np.asarray((image.clamp(0.0, 1.0) * 255).round().to(torch.uint8).cpu().numpy())
 
@@ -264,7 +265,7 @@ def log_pictures(loggers: Sequence[Logger], pictures: Sequence[Path], step: int)
 
 
 @contextmanager
-def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Callable[[NDArray[np.uint8]], Any]]:
+def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Callable[[Uint8s], Any]]:
     """Write a video atomically: it is there when the block ends without an error.
 
     The block gets a function that adds a picture ``[H, W, 3]``, RGB.

@@ -2,7 +2,6 @@
 
 import base64
 import json
-import os
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -15,7 +14,7 @@ from typing import Any
 import torch
 
 from nsvq_lightning.data.scene import Scene
-from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.io.atomic import StrPath, write_text
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
@@ -28,7 +27,6 @@ def some_cameras(scene: Scene) -> dict[str, Camera]:
     return dict(list(zip(scene.names, scene.cameras, strict=True))[:: -(-len(scene) // 300)])
 
 
-StrPath = str | os.PathLike[str]
 Color = Sequence[float]  # RGB in [0, 1]
 # RGB of the backgrounds that have names.
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}

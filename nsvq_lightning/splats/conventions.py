@@ -1,9 +1,18 @@
-"""How splats are laid out: quaternions, coefficients of an SH degree. Without torch, so that files are read fast."""
+"""How splats are laid out: arrays, quaternions, coefficients of an SH degree. Without torch: files open fast."""
 
 import math
 
 import numpy as np
 from numpy.typing import NDArray
+
+# NumPy arrays of any shape, by the type of their numbers.
+Float32s = NDArray[np.float32]
+Float64s = NDArray[np.float64]
+Int32s = NDArray[np.int32]
+Int64s = NDArray[np.int64]
+Uint8s = NDArray[np.uint8]
+Uint32s = NDArray[np.uint32]
+Uint64s = NDArray[np.uint64]
 
 # Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh0.
 SH_C0 = 0.5 / math.sqrt(math.pi)
@@ -36,14 +45,14 @@ def shN_degree(coefficients: int) -> int:
 MIN_SQUARED_NORM = 1e-24
 
 
-def unit(quats: NDArray[np.float32]) -> NDArray[np.float64]:
+def unit(quats: Float32s) -> Float64s:
     """Quaternions wxyz ``[N, 4]`` scaled to length 1; zero becomes the identity."""
     wide = quats.astype(np.float64)
     length = np.linalg.norm(wide, axis=1, keepdims=True)
     return np.where(length > 0, wide / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
 
 
-def turned(quats: NDArray[np.float32], rotation: NDArray[np.float64]) -> NDArray[np.float32]:
+def turned(quats: Float32s, rotation: Float64s) -> Float32s:
     """Quaternions wxyz ``[N, 4]`` after all axes have turned by a rotation ``[3, 3]``; lengths stay."""
     from scipy.spatial.transform import Rotation  # slow to import, and few files are turned
 
@@ -56,7 +65,7 @@ def turned(quats: NDArray[np.float32], rotation: NDArray[np.float64]) -> NDArray
 _OTHERS = np.array([[j for j in range(4) if j != i] for i in range(4)])
 
 
-def smallest_three(units: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def smallest_three(units: Float64s) -> tuple[NDArray[np.intp], Float64s]:
     """Index of the largest component ``[N]``, and the other three ``[N, 3]`` in order, each in ±1/√2.
 
     Args:
@@ -71,7 +80,7 @@ def smallest_three(units: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArra
     return largest, np.where(negative, -others, others)
 
 
-def from_smallest_three(largest: NDArray[np.intp], others: NDArray[np.float64]) -> NDArray[np.float32]:
+def from_smallest_three(largest: NDArray[np.intp], others: Float64s) -> Float32s:
     """Unit quaternions ``[N, 4]`` from the two results of :func:`smallest_three`; the second may be rounded."""
     quats = np.empty((len(largest), 4))
     np.put_along_axis(quats, _OTHERS[largest], others, 1)

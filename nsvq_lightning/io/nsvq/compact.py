@@ -22,7 +22,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from nsvq_lightning.io import errors, morton
 from nsvq_lightning.io.compressed import CompressedScene
@@ -32,6 +31,7 @@ from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 from nsvq_lightning.io.nsvq.precision import MOST_OPACITY_LEVELS, Precision
 from nsvq_lightning.io.nsvq.rounding import leaf_paths
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
+from nsvq_lightning.splats.conventions import Int32s, Int64s, Uint64s
 
 # Attributes by when their streams come; the cells of the positions, which are between, follow from the early ones.
 _EARLY, _LATE = ("opacities", "scales"), tuple(name for name in QUANTIZABLE if name != "scales")
@@ -122,13 +122,13 @@ def _workers() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=torch.get_num_threads())
 
 
-def _before(count: int) -> NDArray[np.int32]:
+def _before(count: int) -> Int32s:
     """The two rows ``[N, 2]`` before each row, -1 where there is none."""
     rows = np.arange(count, dtype=np.int32)[:, None] - np.array([1, 2], np.int32)
     return np.maximum(rows, np.int32(-1))
 
 
-def _neighbours(keys: NDArray[np.uint64], depths: NDArray[np.int64], count: int) -> NDArray[np.int32]:
+def _neighbours(keys: Uint64s, depths: Int64s, count: int) -> Int32s:
     """Two near rows ``[N, 2]`` before each row; for the far splats, which come last, the two rows before."""
     half = (np.int64(1) << (morton.AXIS_BITS - depths)) >> 1
     neighbours = _before(count)
@@ -136,7 +136,7 @@ def _neighbours(keys: NDArray[np.uint64], depths: NDArray[np.int64], count: int)
     return neighbours
 
 
-def _encoded(attribute: rounding.Stored, order: NDArray[np.int64], neighbours: NDArray[np.int32]) -> dict[str, bytes]:
+def _encoded(attribute: rounding.Stored, order: Int64s, neighbours: Int32s) -> dict[str, bytes]:
     """The streams of an attribute, but not of the positions, for splats in an order."""
     entry, values, codebook = attribute.entry, attribute.values[order], attribute.codebook
     if entry.storage == "steps":
@@ -148,7 +148,7 @@ def _encoded(attribute: rounding.Stored, order: NDArray[np.int64], neighbours: N
     return paths if codebook is None else paths | {f"{entry.name}.codebook": entropy.encode_integers(codebook)}
 
 
-def _decoded(entry: AttributeEntry, streams: Mapping[str, memoryview], near: NDArray[np.int32]) -> rounding.Stored:
+def _decoded(entry: AttributeEntry, streams: Mapping[str, memoryview], near: Int32s) -> rounding.Stored:
     """Invert :func:`_encoded`."""
     if entry.storage == "steps":
         return rounding.Stored(entry, entropy.decode_integers(streams[entry.name], len(near), entry.dim))

@@ -14,6 +14,7 @@ from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array, outside
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.nsvq import range_coder as rc
+from nsvq_lightning.splats.conventions import Int32s, Int64s, Uint32s, Uint64s
 
 # Bits of a key; the highest is bit 62.
 KEY_BITS = 63
@@ -25,7 +26,7 @@ _MODELLED_BITS = 16
 _RELATIONS = 9
 
 
-def encode_paths(paths: NDArray[np.int64], bits: int, neighbours: NDArray[np.int32]) -> bytes:
+def encode_paths(paths: Int64s, bits: int, neighbours: Int32s) -> bytes:
     """Bytes of paths ``[N]`` of ``bits`` decisions each, the first one in the highest bit.
 
     A decision's context is the node of the tree where it is taken, and the branches that two earlier paths took there.
@@ -46,7 +47,7 @@ def encode_paths(paths: NDArray[np.int64], bits: int, neighbours: NDArray[np.int
     return _bytes(words, used)
 
 
-def _check_paths(bits: int, neighbours: NDArray[np.int32]) -> None:
+def _check_paths(bits: int, neighbours: Int32s) -> None:
     if not 0 <= bits <= 32:
         raise ValueError(f"a path must have 0 to 32 bits, got {bits}")
     check_array("neighbours", neighbours, (len(neighbours), 2), INT32)
@@ -54,7 +55,7 @@ def _check_paths(bits: int, neighbours: NDArray[np.int32]) -> None:
         raise ValueError(f"neighbours must be in [-1, {len(neighbours)}), got {neighbours.min()} to {neighbours.max()}")
 
 
-def decode_paths(data: bytes | memoryview, bits: int, neighbours: NDArray[np.int32]) -> NDArray[np.int64]:
+def decode_paths(data: bytes | memoryview, bits: int, neighbours: Int32s) -> Int64s:
     """Invert :func:`encode_paths` with the same ``bits`` and ``neighbours``.
 
     Raises:
@@ -77,7 +78,7 @@ _KEY_MASK = uint64((1 << KEY_BITS) - 1)
 _OUTSIDE = -1
 
 
-def encode_keys(keys: NDArray[np.uint64], depths: NDArray[np.int64]) -> bytes:
+def encode_keys(keys: Uint64s, depths: Int64s) -> bytes:
     """Bytes of ascending keys ``[N]``, of each only the highest ``depths [N]`` of 63 bits; the others must be 0.
 
     What is written is the difference from the previous key, in units of the key's own depth: its number of bits by an
@@ -96,13 +97,13 @@ def encode_keys(keys: NDArray[np.uint64], depths: NDArray[np.int64]) -> bytes:
     return _bytes(words, _write_keys(keys, depths, words, rc.new_contexts(_KEY_CONTEXTS)))
 
 
-def _check_depths(depths: NDArray[np.int64]) -> None:
+def _check_depths(depths: Int64s) -> None:
     check_array("depths", depths, (depths.size,), INT64)
     if depths.size and (depths.min() < 0 or depths.max() > KEY_BITS):
         raise outside("depths", depths, KEY_BITS + 1)
 
 
-def decode_keys(data: bytes | memoryview, depths: NDArray[np.int64]) -> NDArray[np.uint64]:
+def decode_keys(data: bytes | memoryview, depths: Int64s) -> Uint64s:
     """Invert :func:`encode_keys` with the same ``depths``.
 
     Raises:
@@ -119,7 +120,7 @@ def decode_keys(data: bytes | memoryview, depths: NDArray[np.int64]) -> NDArray[
     return keys
 
 
-def encode_integers(values: NDArray[np.int64]) -> bytes:
+def encode_integers(values: Int64s) -> bytes:
     """Bytes of integers ``[N, D]`` of absolute value below 2⁵².
 
     Each column is written as values or as differences from row to row, whichever is smaller; one byte per column says
@@ -141,7 +142,7 @@ def encode_integers(values: NDArray[np.int64]) -> bytes:
     return by_steps.astype(np.uint8).tobytes() + _bytes(words, used)
 
 
-def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> NDArray[np.int64]:
+def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> Int64s:
     """Invert :func:`encode_integers`.
 
     Raises:
@@ -161,22 +162,22 @@ def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> NDArra
 # Words and bytes
 
 
-def _room(bits: int) -> NDArray[np.uint32]:
+def _room(bits: int) -> Uint32s:
     """Enough words for this many modelled bits: an unlikely bit costs up to 11 bits."""
     return np.zeros(11 * bits // 32 + 4, np.uint32)
 
 
-def _bytes(words: NDArray[np.uint32], used: int) -> bytes:
+def _bytes(words: Uint32s, used: int) -> bytes:
     return words[:used].astype("<u4", copy=False).tobytes()
 
 
-def _words(data: bytes | memoryview) -> NDArray[np.uint32]:
+def _words(data: bytes | memoryview) -> Uint32s:
     if len(data) % 4:
         raise FormatError(f"damaged: an entropy-coded stream of {len(data)} bytes, not a multiple of 4")
     return np.frombuffer(data, "<u4").astype(np.uint32, copy=False)
 
 
-def _check_used(words: NDArray[np.uint32], used: int) -> None:
+def _check_used(words: Uint32s, used: int) -> None:
     """Refuse a stream that is not used up; the decoder reads one word ahead."""
     if used != len(words) + 1:
         raise FormatError(f"damaged: an entropy-coded stream of {len(words)} words, of which {used - 1} were read")
@@ -346,9 +347,9 @@ def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
 _INTEGER_CONTEXTS = 2 << _LENGTH_BITS
 
 
-def _bit_lengths(values: NDArray[np.int64]) -> NDArray[np.int64]:
+def _bit_lengths(values: Int64s) -> Int64s:
     """Bit length of each absolute value; 0 for 0."""
-    exponents: NDArray[np.int64] = np.frexp(np.abs(values).astype(np.float64))[1].astype(np.int64)
+    exponents: Int64s = np.frexp(np.abs(values).astype(np.float64))[1].astype(np.int64)
     return exponents
 
 

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.io.atomic import atomic_write
+from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry, frame, read_frame
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, listed
+from nsvq_lightning.splats.conventions import Float32s
 
 
 def encode(scene: CompressedScene, storage: Storage) -> tuple[Header, dict[str, bytes]]:
@@ -33,7 +34,7 @@ def encode(scene: CompressedScene, storage: Storage) -> tuple[Header, dict[str, 
     return encode_paper(scene)
 
 
-def write_nsvq(path: str | os.PathLike[str], scene: CompressedScene, storage: Storage | None = None) -> int:
+def write_nsvq(path: StrPath, scene: CompressedScene, storage: Storage | None = None) -> int:
     """Write a scene to a file, replaced atomically; the same arguments give the same bytes.
 
     Args:
@@ -70,7 +71,7 @@ def as_stored(scene: CompressedScene, storage: Storage) -> CompressedScene:
     return decode(header, {name: memoryview(data) for name, data in streams.items()})
 
 
-def read_nsvq(path: str | os.PathLike[str]) -> CompressedScene:
+def read_nsvq(path: StrPath) -> CompressedScene:
     """Read a scene: exact for level ``paper``; within its precision, with splats reordered, for ``compact``.
 
     Raises:
@@ -239,5 +240,5 @@ def _check_tables(header: Header) -> None:
         raise FormatError("damaged: the stream table does not fit the attribute table and the number of splats")
 
 
-def _floats(data: memoryview, rows: int, dim: int) -> NDArray[np.float32]:
+def _floats(data: memoryview, rows: int, dim: int) -> Float32s:
     return np.frombuffer(data, "<f4").astype(np.float32).reshape(rows, dim)

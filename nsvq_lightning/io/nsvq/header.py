@@ -17,6 +17,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_type_hints
 
+from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 
@@ -239,18 +240,18 @@ def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
     return header, streams
 
 
-def read_frame(path: str | os.PathLike[str]) -> tuple[Header, dict[str, memoryview]]:
+def read_frame(path: StrPath) -> tuple[Header, dict[str, memoryview]]:
     """:func:`unframe` for a file, with its name in every error."""
     with naming_file(path):
         return unframe(Path(path).read_bytes())
 
 
-def read_header(path: str | os.PathLike[str]) -> Header:
+def read_header(path: StrPath) -> Header:
     """Header of a ``.nsvq`` file, after verifying the checksum of the whole file."""
     return read_frame(path)[0]
 
 
-def describe_nsvq(path: str | os.PathLike[str]) -> dict[str, Any]:
+def describe_nsvq(path: StrPath) -> dict[str, Any]:
     """Facts about a file, as JSON values; errors are those of :func:`read_header`."""
     header, total = read_header(path), os.path.getsize(path)
     parts = [("header", "json", total - sum(stream.length for stream in header.streams))]

@@ -9,15 +9,15 @@ at the n-th and finally by 1/128: as exact as a count at first, as adaptive as a
 
 import numpy as np
 from numba import uint32, uint64
-from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline
+from nsvq_lightning.splats.conventions import Uint32s
 
 # Number of bits after which the probability of a context moves at its slowest.
 COUNT_LIMIT = 126
 
 
-def new_contexts(count: int) -> NDArray[np.uint32]:
+def new_contexts(count: int) -> Uint32s:
     """States ``[count]``: the probability of a 1 in 65536ths times 256, plus how many bits were met."""
     return np.full(count, 1 << 23, np.uint32)
 

@@ -18,7 +18,7 @@ from nsvq_lightning.io.morton import Grid
 from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.io.numbers import coarsest_power, nearest_power, opacity_of
-from nsvq_lightning.splats.conventions import unit
+from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s, unit
 
 # Coefficients and integers of a basis are below it in size: float32 has them, and 45 products add up to less than 2^52.
 SMALL = 1 << 23
@@ -34,16 +34,16 @@ class Stored(NamedTuple):
     """
 
     entry: AttributeEntry
-    values: NDArray[np.int64]
-    codebook: NDArray[np.int64] | None = None
+    values: Int64s
+    codebook: Int64s | None = None
 
-    def row_sums(self) -> NDArray[np.int64]:
+    def row_sums(self) -> Int64s:
         """Sum ``[N]`` of each splat's integers."""
-        sums: NDArray[np.int64]
+        sums: Int64s
         sums = self.values.sum(1) if self.codebook is None else self.codebook.sum(1)[self.values]
         return sums
 
-    def floats(self) -> NDArray[np.float32]:
+    def floats(self) -> Float32s:
         """The codebook ``[K, D]`` or the basis ``[C, D]``, or the rows ``[N, D]`` where there is none."""
         integers = self.values if self.codebook is None else self.codebook
         # In place of a float64 copy, which would take twice the memory of the result.
@@ -71,7 +71,7 @@ def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
     return _coded(name, scene.codes[name], scene.codebooks[name], precision.codebook)
 
 
-def _coded(name: str, codes: NDArray[np.integer], codebook: NDArray[np.float32], error: float) -> Stored:
+def _coded(name: str, codes: NDArray[np.integer], codebook: Float32s, error: float) -> Stored:
     used = np.bincount(codes, minlength=len(codebook)) > 0
     rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
     distinct = np.unique(unit(rows).astype(np.float32) if name == "quats" else rows, axis=0)
@@ -84,13 +84,13 @@ def _coded(name: str, codes: NDArray[np.integer], codebook: NDArray[np.float32],
     return Stored(entry, place[merged.reshape(-1)[np.cumsum(used)[codes] - 1]], integers[order])
 
 
-def _step(rows: NDArray[np.float32], wanted: float) -> float:
+def _step(rows: Float32s, wanted: float) -> float:
     """The lattice which all values lie on already, unless it is over four times finer than ``wanted``: then this."""
     lattice = coarsest_power(rows)
     return lattice if 4 * lattice >= wanted else wanted
 
 
-def _integers(name: str, rows: NDArray[np.float32], step: float, limit: float = 2.0**52) -> NDArray[np.int64]:
+def _integers(name: str, rows: Float32s, step: float, limit: float = 2.0**52) -> Int64s:
     """The rows ``[N, D]`` as multiples of a step; quaternions are normalised first, unless they are multiples of it."""
     values = np.rint(rows.astype(np.float64) / step)
     if name == "quats" and not np.array_equal((values * step).astype(np.float32), rows):
@@ -103,7 +103,7 @@ def _integers(name: str, rows: NDArray[np.float32], step: float, limit: float = 
 # Opacities
 
 
-def logits_of_levels(count: int) -> NDArray[np.float32]:
+def logits_of_levels(count: int) -> Float32s:
     """Logit ``[count]`` of the middle of each level."""
     shares = (np.arange(count) + 0.5) / count
     return (np.log(shares) - np.log1p(-shares)).astype(np.float32)
@@ -112,9 +112,7 @@ def logits_of_levels(count: int) -> NDArray[np.float32]:
 # Positions
 
 
-def position_grid(
-    means: NDArray[np.float32], stored: Mapping[str, Stored], precision: Precision
-) -> tuple[Grid, float, NDArray[np.int64]]:
+def position_grid(means: Float32s, stored: Mapping[str, Stored], precision: Precision) -> tuple[Grid, float, Int64s]:
     """The grid of the positions ``[N, 3]``, the doublings of its step for a splat of size 1, and the depths ``[N]``.
 
     Args:
@@ -128,7 +126,7 @@ def position_grid(
     return grid, for_size_one, grid.depths(doublings_of(stored, for_size_one))
 
 
-def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> NDArray[np.float64]:
+def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> Float64s:
     """Base-2 logarithm ``[N]`` of the width of each splat's widest cell, in steps of the grid.
 
     The width is in proportion to the size over the square root of the opacity: what is hardly seen may move further.
@@ -140,7 +138,7 @@ def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> NDArray[n
     """
     scales, levels = stored["scales"], stored["opacities"]
     factor = scales.entry.step / 3 / math.log(2.0)
-    doublings: NDArray[np.float64] = scales.row_sums().astype(np.float64) * factor + for_size_one
+    doublings: Float64s = scales.row_sums().astype(np.float64) * factor + for_size_one
     # The logarithm, linear between powers of two.
     mantissas, exponents = np.frexp((np.arange(levels.entry.codes) + 0.5) / levels.entry.codes)
     logarithms = 2 * mantissas - 2 + exponents
@@ -148,7 +146,7 @@ def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> NDArray[n
     return doublings
 
 
-def tree_order(codebook: NDArray[np.float32]) -> NDArray[np.int64]:
+def tree_order(codebook: Float32s) -> Int64s:
     """Indices ``[K]`` of the rows of ``codebook [K, D]`` in the order of the leaves of a tree.
 
     The rows are cut into two halves across the direction in which they differ most, each half again, and so on; for an
@@ -164,7 +162,7 @@ def tree_order(codebook: NDArray[np.float32]) -> NDArray[np.int64]:
     return order
 
 
-def leaf_paths(count: int) -> NDArray[np.int64]:
+def leaf_paths(count: int) -> Int64s:
     """Path ``[count]`` of each leaf, ascending: the halves taken from the root, ⌈log2 count⌉ bits, 0 after the leaf."""
     low, high = np.zeros(count, np.int64), np.full(count, count, np.int64)
     paths, leaves = np.zeros(count, np.int64), np.arange(count)
@@ -176,7 +174,7 @@ def leaf_paths(count: int) -> NDArray[np.int64]:
     return paths
 
 
-def sibling_distance(ordered: NDArray[np.float32]) -> float:
+def sibling_distance(ordered: Float32s) -> float:
     """How much two neighbours of an ordered codebook typically differ per column; 0 for a single row.
 
     It is the median over the pairs of the root mean square over the columns: how far apart codes are where they are
