@@ -1,24 +1,22 @@
 """A scene as files hold it, some of whose attributes are codes; it is turned and cropped without decoding these."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.splats import attributes as splat
-from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s, shN_degree, turned
+from nsvq_lightning.splats.conventions import Float32s, Float64s, shN_degree, turned
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.frame import Frame
     from nsvq_lightning.splats.splats import Splats, SplatTensors
 
 log = logging.getLogger(__name__)
-
-_T = TypeVar("_T", bound=np.generic)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,32 +142,6 @@ class CompressedScene:
         return Splats.from_tensors(
             *(torch.from_numpy(np.ascontiguousarray(self.values(name))) for name in splat.ATTRIBUTES)
         )
-
-    def table(self, name: str) -> tuple[Float32s, NDArray[np.integer] | None]:
-        """Distinct rows ``[K, D]`` of an attribute and the row of each splat ``[N]``; None where row i is splat i's."""
-        if name in self.codes:
-            return self.codebooks[name], self.codes[name]
-        values = self.values(name)
-        return values.reshape(len(values), splat.attribute_dims(self.sh_degree)[name]), None
-
-    def uses(self, name: str) -> Int64s | None:
-        """How many splats use each row of :meth:`table` ``[K]``; None where each splat has its own."""
-        if name in self.raw:
-            return None
-        return np.bincount(self.codes[name], minlength=len(self.codebooks[name])).astype(np.int64)
-
-    def spread(self, name: str, function: Callable[[Float32s, Int64s | None], NDArray[_T]]) -> NDArray[_T]:
-        """A function of the rows of an attribute, for each splat: computed once per row of the codebook.
-
-        Args:
-            name: Attribute.
-            function: Maps the rows ``[K, D]`` and how many splats use each ``[K]`` (None: one each) to ``[K, ...]``.
-
-        Returns:
-            ``[N, ...]``.
-        """
-        values = function(self.table(name)[0], self.uses(name))
-        return values if name in self.raw else values[self.codes[name]]
 
     def take(self, splats: NDArray[np.integer] | NDArray[np.bool_]) -> "CompressedScene":
         """The scene of some of the splats, by index or by mask ``[N]``; codebooks stay as they are."""

@@ -63,35 +63,30 @@ class Clamped:
     def __init__(self) -> None:
         self._counts: dict[str, int] = {}
 
-    def nearest(
-        self, name: str, values: NDArray[np.floating], ends: tuple[int, int], uses: NDArray[np.integer] | None = None
-    ) -> Int32s:
+    def nearest(self, name: str, values: NDArray[np.floating], ends: tuple[int, int]) -> Int32s:
         """The nearest integers that the format has.
 
         Args:
             name: Attribute, for the message.
-            values: Values ``[K, ...]`` in units of the format.
+            values: Values ``[N, ...]`` in units of the format.
             ends: Smallest and largest integer of the format.
-            uses: How many splats have each row ``[K]``; one each if None. Rows that no splat uses are not counted.
 
         Returns:
-            Integers ``[K, ...]``.
+            Integers ``[N, ...]``.
         """
         rounded = np.clip(np.rint(values), *ends)
-        self._count(name, np.abs(rounded - values) > 0.5 + _ROUNDING, uses)
+        self._count(name, np.abs(rounded - values) > 0.5 + _ROUNDING)
         integers: Int32s = np.nan_to_num(rounded).astype(np.int32)
         return integers
 
-    def within(
-        self, name: str, values: Float32s, low: float, high: float, uses: NDArray[np.integer] | None = None
-    ) -> Float32s:
-        """Values ``[K, ...]`` clamped to [``low``, ``high``]; the other arguments are those of :meth:`nearest`."""
-        self._count(name, (values < low) | (values > high), uses)
+    def within(self, name: str, values: Float32s, low: float, high: float) -> Float32s:
+        """Values ``[N, ...]`` clamped to [``low``, ``high``]; ``name`` is that of :meth:`nearest`."""
+        self._count(name, (values < low) | (values > high))
         return np.clip(values, low, high)
 
-    def _count(self, name: str, beyond: NDArray[np.bool_], uses: NDArray[np.integer] | None) -> None:
-        rows = np.asarray(beyond).any(tuple(range(1, np.ndim(beyond))))
-        self._counts[name] = self._counts.get(name, 0) + int(rows.sum() if uses is None else uses[rows].sum())
+    def _count(self, name: str, beyond: NDArray[np.bool_]) -> None:
+        rows = beyond.any(tuple(range(1, beyond.ndim)))
+        self._counts[name] = self._counts.get(name, 0) + int(rows.sum())
 
     def warn(self, path: StrPath, count: int) -> None:
         """Warn how many of ``count`` splats were clamped to the format's range."""

@@ -94,7 +94,7 @@ def sog_contents(scene: CompressedScene, palette: int = PALETTE_LIMIT) -> dict[s
     texels = {
         "means_l.webp": low,
         "means_u.webp": high,
-        "quats.webp": scene.spread("quats", lambda rows, _: _packed_quats(rows)),
+        "quats.webp": _packed_quats(scene.values("quats")),
         "scales.webp": scales,
         "sh0.webp": np.concatenate([colors, opacities[:, None]], axis=1),
     }
@@ -321,15 +321,14 @@ def _palette(scene: CompressedScene, most: int) -> tuple[Float32s, Int64s]:
     """Palette of spherical harmonics ``[K, D]`` in order of first use, and the row of each splat ``[N]``."""
     from nsvq_lightning.io.palette import find_palette, in_order_of_use  # imports Numba, which readers do without
 
-    rows, codes = scene.table("shN")
-    if len(scene) == 0:
-        return np.zeros((1, rows.shape[1]), np.float32), np.zeros(0, np.int64)
-    if codes is None:
+    if "shN" not in scene.codes:
+        rows = scene.values("shN").reshape(len(scene), -1)
         return in_order_of_use(*find_palette(rows, _visibility(scene), most))
-    used, codes = np.unique(codes, return_inverse=True)
+    used, codes = np.unique(scene.codes["shN"], return_inverse=True)
+    rows = scene.codebooks["shN"][used]
     if len(used) <= PALETTE_LIMIT:
-        return in_order_of_use(rows[used], codes)
-    rows, labels = find_palette(rows[used], np.bincount(codes, _visibility(scene)), most)
+        return in_order_of_use(rows, codes)
+    rows, labels = find_palette(rows, np.bincount(codes, _visibility(scene)), most)
     return in_order_of_use(rows, labels[codes])
 
 
@@ -338,7 +337,7 @@ def _visibility(scene: CompressedScene) -> Float64s:
 
     Every splat counts a little, however small it is compared with the largest.
     """
-    sizes = scene.spread("scales", lambda rows, _: np.sort(rows, axis=1)[:, 1:].mean(1)).astype(np.float64)
+    sizes = np.sort(scene.values("scales"), axis=1)[:, 1:].mean(1).astype(np.float64)
     weight: Float64s = opacity_of(scene.opacities) * np.exp(sizes - sizes.max())
     return weight / float(weight.mean()) + 0.01
 
@@ -368,9 +367,9 @@ def _packed_quats(rows: Float32s) -> Uint8s:
 
 def _leveled(scene: CompressedScene, name: str) -> tuple[Uint8s, list[float]]:
     """Level indices ``[N, D]`` of an attribute, and the levels."""
-    uses = scene.uses(name)
-    levels = scalar_kmeans(scene.table(name)[0], None if uses is None else uses[:, None], _LEVELS)
-    return scene.spread(name, lambda rows, _: nearest_level(rows, levels)), _decimals(levels)
+    values = scene.values(name).reshape(len(scene), -1)
+    levels = scalar_kmeans(values, count=_LEVELS)
+    return nearest_level(values, levels), _decimals(levels)
 
 
 def _packed_sh(rows: Float32s, labels: Int64s, sh_degree: int) -> tuple[dict[str, Any], dict[str, Uint8s]]:

@@ -44,14 +44,11 @@ def write_splat(path: StrPath, scene: CompressedScene) -> int:
     records = np.empty(len(scene), _RECORD)
     records["means"] = scene.means
     # Between the smallest and the largest length that float32 holds with full precision.
-    records["lengths"] = scene.spread(
-        "scales", lambda rows, uses: np.exp(clamped.within("scales", rows, -87.0, 88.0, uses))
-    )
-    records["colors"][:, :3] = scene.spread(
-        "sh0", lambda rows, uses: clamped.nearest("sh0", 255 * (0.5 + SH_C0 * rows), (0, 255), uses=uses)
-    )
+    records["lengths"] = np.exp(clamped.within("scales", scene.values("scales"), -87.0, 88.0))
+    colors = 255 * (0.5 + SH_C0 * scene.values("sh0")[:, 0])
+    records["colors"][:, :3] = clamped.nearest("sh0", colors, (0, 255))
     records["colors"][:, 3] = np.rint(255 * opacity_of(scene.opacities))
-    records["quats"] = scene.spread("quats", lambda rows, _: _packed_quats(rows))
+    records["quats"] = _packed_quats(scene.values("quats"))
     clamped.warn(path, len(scene))
     write_bytes(path, records.tobytes())
     return records.nbytes

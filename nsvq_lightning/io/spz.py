@@ -46,7 +46,8 @@ from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, in_morton_ord
 from nsvq_lightning.io.errors import FormatError, check_room, naming_file, wrong_start
 from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, opacity_of
 from nsvq_lightning.splats import conventions
-from nsvq_lightning.splats.conventions import Float32s, Int64s, Uint8s, Uint32s
+from nsvq_lightning.splats.attributes import attribute_dims
+from nsvq_lightning.splats.conventions import Float32s, Uint8s, Uint32s
 
 logger = logging.getLogger(__name__)
 
@@ -328,7 +329,7 @@ def write_spz(
         "opacities": np.rint(255 * opacity_of(scene.opacities)).astype(np.uint8),
         "sh0": _packed(scene, "sh0", _COLOR * 255, 127.5, clamped),
         "scales": _packed(scene, "scales", 16, 160, clamped),
-        "quats": scene.spread("quats", lambda rows, _: _packed_quats(rows * quats)),
+        "quats": _packed_quats(scene.values("quats") * quats),
         "shN": _packed(scene, "shN", 128 * harmonics, 128, clamped),
     }
     clamped.warn(path, len(scene))
@@ -345,7 +346,7 @@ def _fraction_bits(scene: CompressedScene) -> int:
     """
     if len(scene) == 0:
         return _USUAL_FRACTION
-    sizes = scene.spread("scales", lambda rows, _: rows.mean(1))
+    sizes = scene.values("scales").mean(1)
     # No coordinate is off by more than a twentieth of the splat's size, but for the smallest thousandth of the splats.
     needed = math.ceil(-(math.log2(2 * 0.05) + float(np.quantile(sizes, 0.001)) / math.log(2)))
     farthest, far = np.abs(scene.means).max(), np.quantile(np.abs(scene.means).max(1), 0.999)
@@ -354,15 +355,12 @@ def _fraction_bits(scene: CompressedScene) -> int:
 
 
 def _packed(scene: CompressedScene, name: str, factor: float | Float32s, zero: float, clamped: Clamped) -> Uint8s:
-    def packed(rows: Float32s, uses: Int64s | None) -> Uint8s:
-        found = np.empty(rows.shape, np.uint8)
-        for start in range(0, len(rows), 1 << 16):  # so that temporary arrays stay small
-            block = slice(start, start + (1 << 16))
-            some = None if uses is None else uses[block]
-            found[block] = clamped.nearest(name, factor * rows[block] + zero, (0, 255), some)
-        return found
-
-    return scene.spread(name, packed)
+    found = np.empty((len(scene), attribute_dims(scene.sh_degree)[name]), np.uint8)
+    for start in range(0, len(scene), 1 << 16):  # so that temporary arrays stay small
+        block = slice(start, start + (1 << 16))
+        rows = scene.values(name, block)
+        found[block] = clamped.nearest(name, factor * rows.reshape(len(rows), -1) + zero, (0, 255))
+    return found
 
 
 def _packed_quats(rows: Float32s) -> Uint32s:

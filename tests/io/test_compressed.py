@@ -39,7 +39,9 @@ def test_a_turned_scene_is_the_same_scene(degree: int, kind: str) -> None:
     turned = rotated(scene, rotation)
     assert [len(rows) for rows in turned.codebooks.values()] == [len(rows) for rows in scene.codebooks.values()]
     if scene.bases:
-        expanded = replace(scene, raw={name: scene.table(name)[0] for name in scene.raw}, bases={})
+        expanded = replace(
+            scene, raw={name: scene.values(name).reshape(len(scene), -1) for name in scene.raw}, bases={}
+        )
         np.testing.assert_allclose(turned.values("shN"), rotated(expanded, rotation).values("shN"), rtol=0, atol=1e-6)
         np.testing.assert_array_equal(turned.raw["shN"], scene.raw["shN"])
     middle = np.array(scene.origin)

@@ -177,7 +177,7 @@ def encode_paper(scene: CompressedScene) -> tuple[Header, dict[str, bytes]]:
     header = paper_header(scene)
     coded = [entry for entry in header.attributes if entry.storage == "codes"]
     floats = {"means": scene.means, "opacities": scene.opacities}
-    floats |= {name: scene.table(name)[0] for name in scene.raw}
+    floats |= {name: scene.values(name) for name in scene.raw}
     floats |= {f"{name}.codebook": values for name, values in scene.codebooks.items()}
     streams = {name: values.astype("<f4", copy=False).tobytes() for name, values in floats.items()}
     if coded:
