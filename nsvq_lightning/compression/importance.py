@@ -91,13 +91,17 @@ def sensitivity(
     raw = RawSplats(*(tensor.requires_grad_() for tensor in detached(splats)))
     with torch.enable_grad():
         image = render(raw, camera).image
-    draws = torch.randint(0, 2, image.shape, generator=signs, dtype=torch.int8).to(image) * 2 - 1
-    gradients = torch.autograd.grad(image, raw, apply_mask(draws, mask), allow_unused=True)
+    gradients = torch.autograd.grad(image, raw, apply_mask(_drawn(signs, image), mask), allow_unused=True)
     squares = (
         torch.zeros_like(tensor) if gradient is None else gradient.square_()
         for tensor, gradient in zip(raw, gradients, strict=True)
     )
     return RawSplats(*squares), image.detach()
+
+
+def _drawn(signs: torch.Generator, image: Tensor) -> Tensor:
+    """1 or -1 for each channel of a picture, equally likely."""
+    return torch.randint(0, 2, image.shape, generator=signs, dtype=torch.int8).to(image) * 2 - 1
 
 
 def below_cap(splats: SplatTensors) -> RawSplats:
@@ -166,8 +170,12 @@ def floaters(splats: SplatTensors, views: Callable[[], Iterable[View]], render: 
     return mask
 
 
+# Draws of signs for each view: the estimate of a splat seen in five views has a relative error of 0.3.
+PROBES = 4
+
+
 def removal_effects(
-    splats: SplatTensors, views: Iterable[View], render: Renderer, signs: torch.Generator, probes: int = 4
+    splats: SplatTensors, views: Iterable[View], render: Renderer, signs: torch.Generator
 ) -> tuple[Tensor, Tensor, float]:
     """What removing each splat, and no other one, does to the squared error of pictures.
 
@@ -182,8 +190,6 @@ def removal_effects(
         views: Cameras and photos; pixels that do not count have no error.
         render: The rasterizer.
         signs: Generator of the signs, on the CPU.
-        probes: Draws of signs for each view; with 4, the estimate of a splat seen in five views has a relative error
-            of 0.3.
 
     Returns:
         Both sums ``[N]``, and Σ e².
@@ -201,8 +207,7 @@ def removal_effects(
         error += float(difference.double().square().sum())
         (gradient,) = torch.autograd.grad(image, opacities, 2 * difference, retain_graph=True)
         slope += scale * gradient
-        for _ in range(probes):
-            draws = torch.randint(0, 2, image.shape, generator=signs, dtype=torch.int8).to(image) * 2 - 1
-            (gradient,) = torch.autograd.grad(image, opacities, draws, retain_graph=True)
-            curvature += (scale * gradient).square_() / probes
+        for _ in range(PROBES):
+            (gradient,) = torch.autograd.grad(image, opacities, _drawn(signs, image), retain_graph=True)
+            curvature += (scale * gradient).square_() / PROBES
     return slope, curvature, error

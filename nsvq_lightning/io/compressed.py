@@ -330,6 +330,8 @@ def placed(scene: CompressedScene, frame: "Frame") -> CompressedScene:
 
 def with_degree(scene: CompressedScene, degree: int) -> CompressedScene:
     """The scene with spherical harmonics up to a degree, 0 to 3: higher ones are left out, missing ones are 0."""
+    if degree == scene.sh_degree:
+        return scene
     dims = splat.attribute_dims(scene.sh_degree)["shN"], splat.attribute_dims(degree)["shN"]
 
     def rows(tables: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -361,11 +363,10 @@ def joined(scenes: Sequence[CompressedScene]) -> CompressedScene:
     if len({scene.antialiased for scene in scenes}) > 1:
         raise ValueError("some of the scenes were trained with anti-aliasing and some were not; they cannot be joined")
     degree = max(scene.sh_degree for scene in scenes)
-    scenes = [scene if scene.sh_degree == degree else with_degree(scene, degree) for scene in scenes]
+    scenes = [with_degree(scene, degree) for scene in scenes]
     shared = [name for name in splat.QUANTIZABLE if all(name in scene.codes for scene in scenes)]
     starts = {name: np.cumsum([0, *(len(scene.codebooks[name]) for scene in scenes)]) for name in shared}
-    shifts = [np.array(scene.origin) - np.array(first.origin) for scene in scenes]
-    means = [scene.means + shift for scene, shift in zip(scenes, shifts, strict=True)]
+    means = [scene.means + (np.array(scene.origin) - np.array(first.origin)) for scene in scenes]
     dims = splat.attribute_dims(degree)
     return CompressedScene(
         np.concatenate(means).astype(np.float32),

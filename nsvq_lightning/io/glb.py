@@ -72,10 +72,13 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
         is_byte = values.dtype == np.uint8
         accessors.append(accessor | {"componentType": _BYTE if is_byte else _FLOAT, "normalized": is_byte})
         end += values.nbytes
-    if len(scene):
-        accessors[0] |= {"min": scene.means.min(0).tolist(), "max": scene.means.max(0).tolist()}
-    about = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    about |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
+    accessors[0] |= {"min": scene.means.min(0).tolist(), "max": scene.means.max(0).tolist()}
+    about = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
     attributes = {name: number for number, name in enumerate(arrays)}
     primitive = {"mode": 0, "attributes": attributes, "extensions": {EXTENSION: about}}
     asset: dict[str, Any] = {"version": "2.0", "generator": "nsvq-lightning"}

@@ -109,12 +109,12 @@ def _tree(levels: Sequence[CompressedScene]) -> tuple[_Node, list[tuple[_Rows, _
     leaves: list[tuple[_Rows, _Node]] = []
 
     def node(rows: _Rows) -> _Node:
-        lows, highs = ([box[some] for box, some in zip(ends, rows, strict=True)] for ends in zip(*boxes, strict=True))
-        low, high = np.concatenate(lows).min(0, initial=np.inf), np.concatenate(highs).max(0, initial=-np.inf)
-        bound = {name: [float(f"{x:.7g}") for x in end] for name, end in (("min", low), ("max", high))}
+        inside = np.concatenate([ends[some] for ends, some in zip(boxes, rows, strict=True)])
+        box = {"min": inside[:, 0].min(0), "max": inside[:, 1].max(0)}
+        bound = {name: [float(f"{x:.7g}") for x in end] for name, end in box.items()}
         positions = [level.means[some] for level, some in zip(levels, rows, strict=True)]
-        axis = int(positions[0].std(0).argmax()) if len(rows[0]) else 0
-        middle = np.median(positions[0][:, axis]) if len(rows[0]) else 0.0
+        axis = int(positions[0].std(0).argmax())
+        middle = np.median(positions[0][:, axis])
         below = [points[:, axis] < middle for points in positions]
         if len(rows[0]) > LEAF and below[0].any():
             halves = [[some[side ^ upper] for some, side in zip(rows, below, strict=True)] for upper in (False, True)]
@@ -130,14 +130,14 @@ def _tree(levels: Sequence[CompressedScene]) -> tuple[_Node, list[tuple[_Rows, _
 _REACH = 3.0
 
 
-def _boxes(scene: CompressedScene) -> tuple[Float64s, Float64s]:
-    """Smallest and largest coordinates ``[N, 3]`` of the ellipsoid of each splat."""
+def _boxes(scene: CompressedScene) -> Float64s:
+    """Smallest and largest coordinates ``[N, 2, 3]`` of the ellipsoid of each splat."""
     from scipy.spatial.transform import Rotation
 
-    axes = Rotation.from_quat(unit(scene.values("quats"))[:, [1, 2, 3, 0]]).as_matrix() if len(scene) else np.eye(3)
+    axes = Rotation.from_quat(unit(scene.values("quats"))[:, [1, 2, 3, 0]]).as_matrix()
     lengths = np.exp(scene.values("scales").astype(np.float64))
     reach = _REACH * np.sqrt(np.square(axes * lengths[:, None, :]).sum(2))
-    return scene.means - reach, scene.means + reach
+    return np.stack([scene.means - reach, scene.means + reach], axis=1)
 
 
 def _files(runs: list[NDArray[np.intp]]) -> Iterator[list[int]]:
@@ -151,7 +151,7 @@ def _files(runs: list[NDArray[np.intp]]) -> Iterator[list[int]]:
         if len(rows):
             some.append(leaf)
             count += len(rows)
-    yield some or [0]
+    yield some
 
 
 # Of an index; one of 100 million splats has a fifth of it.

@@ -428,19 +428,10 @@ def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
         "packed_color": _packed(np.c_[shares(colors, "rgb"), opacity_of(scene.opacities)], 8, 8, 8, 8),
     }
     levels = np.clip(32 * scene.values("shN") + 128, 0, 255).astype(np.uint8)
-    sh = dict(
-        zip(
-            splat_columns(scene.sh_degree)["shN"],
-            levels.swapaxes(1, 2).reshape(len(scene), 3 * levels.shape[1]).T,
-            strict=True,
-        )
-    )
-    tables = [("chunk", "f4", bounds), ("vertex", "u4", words), ("sh", "u1", sh)]
-    elements = {
-        name: np.rec.fromarrays(list(columns.values()), dtype=[(column, f"<{kind}") for column in columns])
-        for name, kind, columns in tables
-        if columns
-    }
+    names = splat_columns(scene.sh_degree)["shN"]
+    sh = dict(zip(names, levels.swapaxes(1, 2).reshape(len(scene), len(names)).T, strict=True))
+    tables = {"chunk": bounds, "vertex": words, "sh": sh}
+    elements = {name: np.rec.fromarrays([*table.values()], names=[*table]) for name, table in tables.items() if table}
     return write_elements(path, elements, _comments(scene.antialiased))
 
 

@@ -347,14 +347,15 @@ def _packed_means(
 ) -> tuple[Uint8s, Uint8s, dict[str, list[float]]]:
     wide = means.astype(np.float64)
     logs = np.copysign(np.log1p(np.abs(wide)), wide)
-    low, high = (logs.min(0), logs.max(0)) if len(logs) else (np.zeros(3), np.zeros(3))
+    low, high = logs.min(0), logs.max(0)
     extent = np.where(high > low, high - low, 1)
-    numbers = np.rint(65535 * ((logs - low) / extent)).astype(np.uint16)
-    return (
-        (numbers & 255).astype(np.uint8),
-        (numbers >> 8).astype(np.uint8),
-        {"mins": low.tolist(), "maxs": high.tolist()},
-    )
+    halves = _low_and_high(np.rint(65535 * ((logs - low) / extent)))
+    return halves[..., 0], halves[..., 1], {"mins": low.tolist(), "maxs": high.tolist()}
+
+
+def _low_and_high(numbers: NDArray[Any]) -> Uint8s:
+    """The two bytes ``[..., 2]`` of whole numbers below 65536."""
+    return numbers.astype("<u2")[..., None].view(np.uint8)
 
 
 def _packed_quats(rows: Float32s) -> Uint8s:
@@ -382,12 +383,11 @@ def _packed_sh(rows: Float32s, labels: Int64s, sh_degree: int) -> tuple[dict[str
         "codebook": _decimals(levels),
         "files": ["shN_centroids.webp", "shN_labels.webp"],
     }
-    numbers = np.stack([labels & 255, labels >> 8], axis=1).astype(np.uint8)
     return meta, {
         "shN_centroids.webp": _picture(
             nearest_level(rows, levels).reshape(-1, 3), (math.ceil(len(rows) / _ROWS_A_LINE), line)
         ),
-        "shN_labels.webp": _picture(numbers, picture_shape(len(labels))),
+        "shN_labels.webp": _picture(_low_and_high(labels), picture_shape(len(labels))),
     }
 
 

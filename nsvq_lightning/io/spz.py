@@ -344,8 +344,6 @@ def _fraction_bits(scene: CompressedScene) -> int:
 
     A few distant splats do not make positions coarser than the format's usual 12 bits; they are clamped.
     """
-    if len(scene) == 0:
-        return _USUAL_FRACTION
     sizes = scene.values("scales").mean(1)
     # No coordinate is off by more than a twentieth of the splat's size, but for the smallest thousandth of the splats.
     needed = math.ceil(-(math.log2(2 * 0.05) + float(np.quantile(sizes, 0.001)) / math.log(2)))

@@ -43,9 +43,8 @@ def write_usda(path: StrPath, scene: CompressedScene) -> int:
             colors.reshape(-1, 3),
             f' (\n        elementSize = {per_splat}\n        interpolation = "vertex"\n    )',
         ),
+        ("float3[] extent", np.stack([scene.means.min(0), scene.means.max(0)]), ""),
     ]
-    if len(scene):
-        arrays.append(("float3[] extent", np.stack([scene.means.min(0), scene.means.max(0)]), ""))
     note = "    customData = { bool antialiased = 1 }\n" if scene.antialiased else ""
     with atomic_write(path) as file:
         file.write(

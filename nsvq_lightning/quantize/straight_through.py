@@ -41,9 +41,9 @@ class TrainedStraightThrough(CodebookQuantizer):
     """
 
     def __init__(
-        self, num_codes: int, dim: int, *, kmeans_steps: int = 10, start: Literal["sample", "spread"] = "spread"
+        self, num_codes: int, dim: int, *, start: Literal["sample", "spread"] = "spread", **settings: Any
     ) -> None:
-        super().__init__(num_codes, dim, kmeans_steps=kmeans_steps, start=start)
+        super().__init__(num_codes, dim, start=start, **settings)
 
     def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator, rows: Tensor | None) -> Tensor:
         """The codes of the rows ``rows [V]`` of ``x [N, D]``; the gradient goes to both."""

@@ -40,6 +40,8 @@ from nsvq_lightning.splats.conventions import Uint8s
 from nsvq_lightning.training.resume import ResumedModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
+Values = Mapping[str, Any]
+
 
 @torch.no_grad()
 def evaluate(
@@ -79,10 +81,10 @@ def evaluate(
 def summarize(
     path: Path,
     scene: CompressedScene,
-    scores: Sequence[Mapping[str, Any]],
+    scores: Sequence[Values],
     lpips: tuple[float | None, str | None],
     module: ResumedModule,
-    paper: Mapping[str, Any],
+    paper: Values,
 ) -> dict[str, Any]:
     """The content of ``metrics.json``; sizes in bytes, PSNR in dB, times in seconds.
 
@@ -124,7 +126,7 @@ def paper_level(scene: CompressedScene) -> dict[str, Any]:
     return {"file_bytes": header.file_bytes, "header_bytes": header.size}
 
 
-def write_metrics(path: Path, metrics: Mapping[str, Any]) -> None:
+def write_metrics(path: Path, metrics: Values) -> None:
     """Write the numbers as JSON, atomically; an infinite PSNR (no error at all) becomes null."""
     finite = json.loads(json.dumps(metrics), parse_constant=lambda name: None)
     write_text(path, json.dumps(finite, indent=2) + "\n")
@@ -143,7 +145,7 @@ def write_figure(path: Path, figure: Any) -> None:
         figure.savefig(file, format="png", bbox_inches="tight")
 
 
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def write_csv(path: Path, rows: Sequence[Values]) -> None:
     """Write rows with the same keys as CSV, atomically; the keys of the first row, in order, are the header."""
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
@@ -162,7 +164,7 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: Co
     return "\n".join(f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))
 
 
-def curve_figure(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> Any:
+def curve_figure(history: Sequence[Values], schedule: Schedule) -> Any:
     """PSNR and number of splats over the iterations, with phases shaded, as a Matplotlib figure."""
     figure = new_figure(8, 4)
     quality = figure.add_subplot()
@@ -225,15 +227,14 @@ def _file_stems(names: tuple[str, ...]) -> dict[str, str]:
     return stems
 
 
-def comparison(image: Tensor, photo: Tensor, gain: float = 4.0) -> Tensor:
-    """Photo, render and absolute error times ``gain``, side by side ``[H, 3·W, 3]``.
+def comparison(image: Tensor, photo: Tensor) -> Tensor:
+    """Photo, render and four times the absolute error, so that small ones show, side by side ``[H, 3·W, 3]``.
 
     Args:
         image: Rendered view ``[H, W, 3]`` in [0, 1].
         photo: Photo ``[H, W, 3]`` in [0, 1].
-        gain: Factor that makes small errors visible.
     """
-    return torch.cat([photo, image, ((image - photo).abs() * gain).clamp(max=1.0)], dim=1)
+    return torch.cat([photo, image, ((image - photo).abs() * 4).clamp(max=1.0)], dim=1)
 
 
 def as_bytes(image: Tensor) -> Uint8s:

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,12 +13,10 @@ import torch
 from cv2.typing import MatLike
 
 from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.report.files import Values
 from nsvq_lightning.report.viewer import data_address, fill, script_json
 from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.version import __version__
-
-Values = Mapping[str, Any]
-
 
 # The file of the page.
 NAME = "report.html"
@@ -27,11 +24,11 @@ NAME = "report.html"
 
 def write_page(
     folder: Path,
-    history: Sequence[Mapping[str, Any]],
+    history: Sequence[Values],
     schedule: Schedule,
     seconds: Mapping[str, float],
-    metrics: Mapping[str, Any] | None = None,
-    views: Sequence[Mapping[str, Any]] = (),
+    metrics: Values | None = None,
+    views: Sequence[Values] = (),
 ) -> Path:
     """Write the page of a run, atomically; without ``metrics``, browsers read it again every few seconds.
 
@@ -93,7 +90,7 @@ def _facts(history: Sequence[Values], schedule: Schedule, metrics: Values | None
     }
 
 
-def _views(folder: Path, views: Sequence[Mapping[str, Any]]) -> str:
+def _views(folder: Path, views: Sequence[Values]) -> str:
     """Photo, render and error of each view, which lie side by side in its picture; ``report.js`` adds the slider."""
     worst = min((row["psnr"] for row in views), default=0.0)
     figures = []
@@ -121,7 +118,7 @@ def _curve(history: Sequence[Values], schedule: Schedule) -> str:
 _Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 
 
-def _sizes(metrics: Mapping[str, Any]) -> dict[str, _Table]:
+def _sizes(metrics: Values) -> dict[str, _Table]:
     """The tables of the file by their headings."""
     splats, whole = max(1, metrics["num_splats"]), metrics["file_bytes"]
     streams = [
@@ -139,7 +136,7 @@ def _sizes(metrics: Mapping[str, Any]) -> dict[str, _Table]:
     }
 
 
-def _times(history: Sequence[Mapping[str, Any]], seconds: Mapping[str, float]) -> dict[str, _Table]:
+def _times(history: Sequence[Values], seconds: Mapping[str, float]) -> dict[str, _Table]:
     """The table of times by its heading."""
     rows = []
     before, since = 0, 0.0
@@ -180,4 +177,6 @@ def _decibels(psnr: float | None) -> str:
 def _duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"

@@ -86,8 +86,8 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
     grid = morton.Grid(entries["means"].step, (base[0], base[1], base[2]))
     far = np.frombuffer(streams["means.far"], "<f4").astype(np.float32).reshape(-1, 3)
     with _workers() as pool:
-        early = [pool.submit(_decoded, entries[name], streams, _before(header.splats)) for name in _EARLY]
-        stored = {task.result().entry.name: task.result() for task in early}
+        early = {name: pool.submit(_decoded, entries[name], streams, _before(header.splats)) for name in _EARLY}
+        stored = {name: early[name].result() for name in _EARLY}
         depths = grid.depths(rounding.doublings_of(stored, doublings))[: header.splats - len(far)]
         keys = entropy.decode_keys(streams["means"], 3 * depths)
         neighbours = _neighbours(keys, depths, header.splats)
@@ -192,12 +192,7 @@ _FAR_BYTES = 12
 def _check_tables(header: Header) -> None:
     """Compare with the tables this release would write, before anything is allocated from their sizes."""
     dims = attribute_dims(header.sh_degree)
-    expected = [(name, dims[name]) for name in (*_EARLY, "means", *_LATE)]
-    if [(entry.name, entry.dim) for entry in header.attributes] != expected:
-        raise FormatError(f"damaged: the attribute table must list {', '.join(dims)}, got {header.attributes}")
-    for entry in header.attributes:
-        if not _possible(entry):
-            raise FormatError(f"damaged: impossible attribute {entry}")
+    header.check_attributes({name: dims[name] for name in (*_EARLY, "means", *_LATE)}, _possible)
     if [(stream.name, stream.encoding) for stream in header.streams] != _stream_names(header.attributes):
         raise FormatError("damaged: the stream table does not fit the attribute table")
     lengths = {stream.name: stream.length for stream in header.streams}

@@ -228,16 +228,15 @@ def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> tuple[StreamEntry
 
 def _check_tables(header: Header) -> None:
     """Compare with the tables this release would write, before anything is allocated from their sizes."""
-    dims = _dims(header.sh_degree)
-    if [(entry.name, entry.dim) for entry in header.attributes] != list(dims.items()):
-        raise FormatError(f"damaged: the attribute table must list {dims}, got {header.attributes}")
-    for entry in header.attributes:
-        raw = entry.storage == "raw" and entry.codes == 0
-        coded = entry.name in QUANTIZABLE and entry.storage == "codes" and 1 <= entry.codes <= 1 << 32
-        if entry.step or not (raw or coded):
-            raise FormatError(f"damaged: impossible attribute {entry}")
+    header.check_attributes(_dims(header.sh_degree), _possible)
     if header.streams != _layout(header.splats, header.attributes):
         raise FormatError("damaged: the stream table does not fit the attribute table and the number of splats")
+
+
+def _possible(entry: AttributeEntry) -> bool:
+    raw = entry.storage == "raw" and entry.codes == 0
+    coded = entry.name in QUANTIZABLE and entry.storage == "codes" and 1 <= entry.codes <= 1 << 32
+    return entry.step == 0 and (raw or coded)
 
 
 def _floats(data: memoryview, rows: int, dim: int) -> Float32s:

@@ -11,7 +11,7 @@ import math
 import os
 import struct
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from hashlib import blake2b
 from pathlib import Path
@@ -114,6 +114,22 @@ class Header:
         """Bytes of the whole file."""
         return self.size + sum(stream.length for stream in self.streams)
 
+    def check_attributes(self, dims: Mapping[str, int], possible: Callable[[AttributeEntry], bool]) -> None:
+        """Compare the attribute table with that of a level, before anything is allocated from its sizes.
+
+        Args:
+            dims: Values per splat by attribute, in the order of the level.
+            possible: Whether an entry is one of the level.
+
+        Raises:
+            FormatError: It is another table.
+        """
+        if [(entry.name, entry.dim) for entry in self.attributes] != list(dims.items()):
+            raise FormatError(f"damaged: the attribute table must list {', '.join(dims)}, got {self.attributes}")
+        for entry in self.attributes:
+            if not possible(entry):
+                raise FormatError(f"damaged: impossible attribute {entry}")
+
     def to_json(self) -> bytes:
         """The JSON text as stored; equal headers give equal bytes.
 
@@ -154,7 +170,7 @@ class Header:
             raise FormatError(f"damaged: SH degree {header.sh_degree}, the highest is 3")
         if len({stream.name for stream in header.streams}) != len(header.streams):
             raise FormatError("damaged: two streams have the same name")
-        if any(isinstance(each, bool) or not isinstance(each, int | float | None) for each in header.metrics.values()):
+        if any(type(each) not in _NUMBERS for each in header.metrics.values() if each is not None):
             raise FormatError("damaged: header entry 'metrics' must hold numbers only")
         return header
 
@@ -164,13 +180,15 @@ def _no_number(name: str) -> None:
 
 
 _T = TypeVar("_T")
+# Types of the numbers of JSON; a bool is none.
+_NUMBERS = (int, float)
 
 
 def _entry(table: object, key: str, kind: type[_T]) -> _T:
     """An entry of a type; numbers must be finite and not negative."""
     value: Any = table.get(key) if isinstance(table, dict) else None
     number = kind in (int, float)
-    fits = isinstance(value, int | float if kind is float else kind) and not isinstance(value, bool)
+    fits = type(value) in _NUMBERS if kind is float else type(value) is kind
     if not fits or (number and not 0 <= value <= sys.float_info.max):
         expected = f"{kind.__name__}, finite and not negative" if number else kind.__name__
         raise FormatError(f"damaged: header entry {key!r} must be of type {expected}, got {str(value)[:60]!r}")
@@ -186,11 +204,12 @@ def _row(kind: type[_T], row: object) -> _T:
 
 
 def _origin(values: list[Any]) -> tuple[float, float, float]:
-    numbers = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
     # Comparing is safe; float() of a huge integer would overflow.
-    if len(values) != 3 or not numbers or not all(abs(value) <= sys.float_info.max for value in values):
+    finite = (type(value) in _NUMBERS and abs(value) <= sys.float_info.max for value in values)
+    if len(values) != 3 or not all(finite):
         raise FormatError("damaged: header entry 'origin' must be three finite numbers")
-    return float(values[0]), float(values[1]), float(values[2])
+    x, y, z = map(float, values)
+    return x, y, z
 
 
 # Its line ends and high bit expose transfers that treat it as text.
