@@ -118,10 +118,12 @@ def _parsed(file: BinaryIO) -> PlyHeader:
     elements = _elements(lines, formats[0], end.end(), file)
     if "vertex" not in elements:
         raise FormatError("the header has no element vertex")
-    # The last comment that says how the splats were trained counts.
+    antialiased = False
     meaning = {key.lower(): value for key, value in _MIP_COMMENTS.items()}
-    said = [line[1:] for line in lines if len(line) == 3 and line[0] == "comment" and line[1].lower() in meaning]
-    antialiased = bool(said) and meaning[said[-1][0].lower()] == said[-1][1].lower()
+    for line in lines:  # the last comment that says how the splats were trained counts
+        match line:
+            case ["comment", key, value] if key.lower() in meaning:
+                antialiased = meaning[key.lower()] == value.lower()
     return replace(elements.pop("vertex"), antialiased=antialiased, others=elements)
 
 

@@ -318,8 +318,10 @@ def write_spz(
     if axes not in SPZ_AXES:
         raise ValueError(f"axes of .spz must be {' or '.join(SPZ_AXES)}, got {axes!r}")
     scene = in_spz_order(scene)
-    clamped, (xyz, quats, harmonics) = Clamped(), _signs(axes.upper(), scene.sh_degree)
-    flags, fraction = ANTIALIASED * scene.antialiased, _fraction_bits(scene)
+    clamped = Clamped()
+    xyz, quats, harmonics = _signs(axes.upper(), scene.sh_degree)
+    flags = ANTIALIASED * scene.antialiased
+    fraction = _fraction_bits(scene)
     # Viewers expect version 3 to be silent, in the default axes; Babylon.js turns a scene that says so upside down.
     stated = axes.upper() if version == 4 or axes != DEFAULT_AXES else ""
     end = 1 << _POSITION - 1

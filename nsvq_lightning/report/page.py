@@ -46,7 +46,8 @@ def write_page(
         The file.
     """
     title = escape(f"{folder.resolve().parent.name} / {folder.resolve().name}")
-    preview, config, viewer = (folder / name for name in ("preview.png", "config.yaml", "viewer.html"))
+    preview = folder / "preview.png"
+    config = folder / "config.yaml"
     sections = {"Test views": _views(folder, views)}
     if metrics is None and preview.exists():
         sections["Photo and render"] = f'<img class="wide" alt="photo and render" src="{_jpeg(_read(preview))}">'
@@ -65,7 +66,9 @@ def write_page(
         "figures": "".join(f"<div>{name}<b>{value}</b></div>" for name, value in facts),
         "how": "measured on the decoded file" if metrics else "as a file written at that moment would decode to",
         "refresh": "" if metrics else '<meta http-equiv="refresh" content="5">',
-        "viewer": '<a class="button" href="viewer.html">Open viewer.html</a>' if viewer.exists() else "",
+        "viewer": '<a class="button" href="viewer.html">Open viewer.html</a>'
+        if (folder / "viewer.html").exists()
+        else "",
     }
     text = fill("report", title=title, sections="\n".join(shown), versions=escape(versions), **parts)
     write_text(folder / NAME, text)

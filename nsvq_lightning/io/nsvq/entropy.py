@@ -114,9 +114,7 @@ def decode_keys(data: bytes | memoryview, depths: Int64s) -> Uint64s:
     _check_depths(depths)
     keys, words = np.empty(len(depths), np.uint64), _words(data)
     used = _read_keys(words, depths, keys, rc.new_contexts(_KEY_CONTEXTS))
-    if used == _OUTSIDE:
-        raise FormatError("damaged: a position is outside its grid")
-    _check_used(words, used)
+    _check_used(words, used, "a position is outside its grid")
     return keys
 
 
@@ -153,9 +151,7 @@ def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> Int64s
     by_steps = np.frombuffer(data[:columns], np.uint8).astype(bool)
     values, words = np.empty((rows, columns), np.int64), _words(data[columns:])
     used = _read_integers(words, by_steps, values, rc.new_contexts(_INTEGER_CONTEXTS * columns))
-    if used == _OUTSIDE:
-        raise FormatError("damaged: an integer is not below 2^52 in size")
-    _check_used(words, used)
+    _check_used(words, used, "an integer is not below 2^52 in size")
     return values
 
 
@@ -177,8 +173,10 @@ def _words(data: bytes | memoryview) -> Uint32s:
     return np.frombuffer(data, "<u4").astype(np.uint32, copy=False)
 
 
-def _check_used(words: Uint32s, used: int) -> None:
-    """Refuse a stream that is not used up; the decoder reads one word ahead."""
+def _check_used(words: Uint32s, used: int, outside: str = "") -> None:
+    """Refuse a stream with a value ``outside`` its range, or that is not used up; the decoder reads one word ahead."""
+    if used == _OUTSIDE:
+        raise FormatError(f"damaged: {outside}")
     if used != len(words) + 1:
         raise FormatError(f"damaged: an entropy-coded stream of {len(words)} words, of which {used - 1} were read")
 

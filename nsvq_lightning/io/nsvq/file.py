@@ -13,7 +13,7 @@ from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry, frame, read_frame
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, listed
-from nsvq_lightning.splats.conventions import Float32s
+from nsvq_lightning.splats.conventions import Float32s, Uint32s
 
 
 def encode(scene: CompressedScene, storage: Storage) -> tuple[Header, dict[str, bytes]]:
@@ -126,7 +126,7 @@ def pack_fields(fields: Sequence[NDArray[np.integer]], widths: Sequence[int]) ->
     return b"".join(chunks)
 
 
-def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) -> list[NDArray[np.unsignedinteger]]:
+def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) -> list[Uint32s]:
     """Invert :func:`pack_fields`.
 
     Args:
@@ -135,11 +135,10 @@ def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) ->
         widths: Bits of each field, 0 to 32.
 
     Returns:
-        One array ``[N]`` per field: uint16 up to 16 bits, uint32 above.
+        One array ``[N]`` per field.
     """
     packed, record = np.frombuffer(data, np.uint8), sum(widths)
-    kinds = (np.uint16 if width <= 16 else np.uint32 for width in widths)
-    fields: list[NDArray[np.unsignedinteger]] = [np.zeros(rows, kind) for kind in kinds]
+    fields = [np.zeros(rows, np.uint32) for _ in widths]
     for start in range(0, rows, _CHUNK):
         count = min(_CHUNK, rows - start)
         chunk = packed[start * record // 8 : (start + _CHUNK) * record // 8]
