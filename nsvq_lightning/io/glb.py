@@ -24,6 +24,9 @@ from nsvq_lightning.splats.conventions import SH_C0, Float32s, Float64s, sh_coef
 
 log = logging.getLogger(__name__)
 
+# An object of JSON.
+_Json = dict[str, Any]
+
 EXTENSION = "KHR_gaussian_splatting"
 OPACITY = f"{EXTENSION}:OPACITY"
 
@@ -63,8 +66,8 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
     shN = scene.values("shN")
     arrays |= {_harmonic(number + 1): shN[:, number] for number in range(sh_coefficients(scene.sh_degree))}
     kinds = {width: name for name, width in _WIDTHS.items()}
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
+    views: list[_Json] = []
+    accessors: list[_Json] = []
     end = 0
     for values in arrays.values():
         views.append({"buffer": 0, "byteOffset": end, "byteLength": values.nbytes, "target": _ARRAY_BUFFER})
@@ -81,7 +84,7 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
     }
     attributes = {name: number for number, name in enumerate(arrays)}
     primitive = {"mode": 0, "attributes": attributes, "extensions": {EXTENSION: about}}
-    asset: dict[str, Any] = {"version": "2.0", "generator": "nsvq-lightning"}
+    asset: _Json = {"version": "2.0", "generator": "nsvq-lightning"}
     if scene.antialiased:
         asset["extras"] = {"antialiased": True}
     document = {
@@ -137,7 +140,7 @@ def read_glb(path: StrPath) -> CompressedScene:
 _MOST_JSON = 1 << 26
 
 
-def _parsed(data: bytes) -> tuple[dict[str, Any], memoryview]:
+def _parsed(data: bytes) -> tuple[_Json, memoryview]:
     """JSON and binary chunk."""
     if len(data) < _HEAD.size + _CHUNK.size or data[:4] != b"glTF":
         raise wrong_start(".glb", data, b"glTF")
@@ -155,7 +158,7 @@ def _parsed(data: bytes) -> tuple[dict[str, Any], memoryview]:
     return document, memoryview(data)[start + length + _CHUNK.size :]
 
 
-def _primitives(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Float64s]]:
+def _primitives(document: _Json) -> Iterator[tuple[_Json, Float64s]]:
     """Those with splats, and the matrix ``[4, 4]`` of the node that each is in."""
     nodes = document["nodes"]
     stack = [(number, np.eye(4)) for number in reversed(document["scenes"][document.get("scene", 0)]["nodes"])]
@@ -172,7 +175,7 @@ def _primitives(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Floa
                 yield primitive, matrix
 
 
-def _matrix(node: dict[str, Any]) -> Float64s:
+def _matrix(node: _Json) -> Float64s:
     """What a node does to what is in it ``[4, 4]``."""
     from scipy.spatial.transform import Rotation
 
@@ -185,7 +188,7 @@ def _matrix(node: dict[str, Any]) -> Float64s:
     return matrix
 
 
-def _splats(document: dict[str, Any], data: memoryview, primitive: dict[str, Any]) -> CompressedScene:
+def _splats(document: _Json, data: memoryview, primitive: _Json) -> CompressedScene:
     """The splats of a primitive, in the axes of the file."""
     about = primitive["extensions"][EXTENSION]
     if inner := about.get("extensions"):
@@ -225,7 +228,7 @@ def _logs_of_scale(scale: Float32s) -> Float32s:
     return scale
 
 
-def _accessor(document: dict[str, Any], data: memoryview, number: int) -> Float32s:
+def _accessor(document: _Json, data: memoryview, number: int) -> Float32s:
     """Rows ``[N, D]`` of an accessor."""
     accessor = document["accessors"][number]
     view = document["bufferViews"][accessor["bufferView"]]

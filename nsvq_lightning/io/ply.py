@@ -433,7 +433,11 @@ def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
     names = splat_columns(scene.sh_degree)["shN"]
     sh = dict(zip(names, levels.swapaxes(1, 2).reshape(len(scene), len(names)).T, strict=True))
     tables = {"chunk": bounds, "vertex": words, "sh": sh}
-    elements = {name: np.rec.fromarrays([*table.values()], names=[*table]) for name, table in tables.items() if table}
+    elements = {}
+    for name, table in tables.items():
+        if table:
+            dtype = [(column, rows.dtype.newbyteorder("<")) for column, rows in table.items()]
+            elements[name] = np.rec.fromarrays(list(table.values()), dtype=dtype)
     return write_elements(path, elements, _comments(scene.antialiased))
 
 

@@ -35,7 +35,7 @@ def scalar_kmeans(values: Float32s, weight: NDArray[np.integer] | None = None, c
     each level to the mean of its values until none moves. On random numbers this ends within a tenth of the optimum.
 
     Args:
-        values: Any shape, finite.
+        values: Any shape, at least one, finite.
         weight: How often each value counts, broadcasts with ``values``; once if None.
         count: Number of levels; the last one is repeated if fewer are enough.
     """
@@ -44,8 +44,7 @@ def scalar_kmeans(values: Float32s, weight: NDArray[np.integer] | None = None, c
     mass = np.bincount(inverse.ravel(), weights, minlength=len(distinct)).astype(np.float64)
     numbers, mass = distinct[mass > 0].astype(np.float64), mass[mass > 0]
     if len(numbers) <= count:
-        padded = np.concatenate([numbers, np.full(count - len(numbers), numbers[-1] if len(numbers) else 0.0)])
-        return padded.astype(np.float32)
+        return np.pad(numbers, (0, count - len(numbers)), "edge").astype(np.float32)
     cells = _Cells(numbers, mass)
     starts = sorted(start for start, _ in split(cells.best_split, len(numbers), count))
     levels = cells.means(np.array([*starts, len(numbers)]), np.zeros(count))

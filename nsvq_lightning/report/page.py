@@ -48,6 +48,7 @@ def write_page(
     title = escape(f"{folder.resolve().parent.name} / {folder.resolve().name}")
     preview = folder / "preview.png"
     config = folder / "config.yaml"
+    viewer = folder / "viewer.html"
     sections = {"Test views": _views(folder, views)}
     if metrics is None and preview.exists():
         sections["Photo and render"] = f'<img class="wide" alt="photo and render" src="{_jpeg(_read(preview))}">'
@@ -66,9 +67,7 @@ def write_page(
         "figures": "".join(f"<div>{name}<b>{value}</b></div>" for name, value in facts),
         "how": "measured on the decoded file" if metrics else "as a file written at that moment would decode to",
         "refresh": "" if metrics else '<meta http-equiv="refresh" content="5">',
-        "viewer": '<a class="button" href="viewer.html">Open viewer.html</a>'
-        if (folder / "viewer.html").exists()
-        else "",
+        "viewer": '<a class="button" href="viewer.html">Open viewer.html</a>' if viewer.exists() else "",
     }
     text = fill("report", title=title, sections="\n".join(shown), versions=escape(versions), **parts)
     write_text(folder / NAME, text)

@@ -38,7 +38,6 @@ def test_few_values_are_exact_and_the_last_level_is_repeated() -> None:
     levels = scalar_kmeans(values, count=8)
     np.testing.assert_array_equal(levels, np.array([-1, 0.5, 3, *[np.pi] * 5], np.float32))
     np.testing.assert_array_equal(levels[nearest_level(values, levels)], values)
-    np.testing.assert_array_equal(scalar_kmeans(np.zeros((0, 3), np.float32)), np.zeros(256, np.float32))
 
 
 def test_a_weight_counts_like_repeated_values() -> None:
