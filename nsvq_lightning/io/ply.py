@@ -92,8 +92,8 @@ _TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8", "half": "f2", "float16": "f2"},
 }
-# Properties of a compressed ``.ply``, and the attributes in them; the opacity is in the colour.
-_PACKED = {"packed_position": "means", "packed_rotation": "quats", "packed_scale": "scales", "packed_color": "sh0"}
+# Properties of a compressed ``.ply``; the opacity is in the colour.
+_PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 # Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene.
 _ROWS = 1 << 12
 # Of a header; some programs write their cameras into its comments.
@@ -235,11 +235,11 @@ def _check_packed(header: PlyHeader) -> None:
     chunk, sh = header.others["chunk"], header.others.get("sh")
     names = ["x", "y", "z", "scale_x", "scale_y", "scale_z", *("rgb" if "min_r" in chunk.properties else "")]
     bounds = [f"{end}_{name}" for end in ("min", "max") for name in names]
-    expected = [(header, dict.fromkeys(_PACKED, "u4")), (chunk, dict.fromkeys(bounds, "f4"))]
+    expected = [(header, _PACKED, "u4"), (chunk, bounds, "f4")]
     if sh:
-        expected.append((sh, dict.fromkeys(sh.properties, "u1")))
-    for table, kinds in expected:
-        for name, kind in kinds.items():
+        expected.append((sh, [*sh.properties], "u1"))
+    for table, columns, kind in expected:
+        for name in columns:
             if name not in table.properties or table.dtype[name].str[1:] != kind:
                 raise FormatError(f"not a compressed .ply of Gaussian splats: no property {name} of type {kind}")
     if header.encoding == "ascii" or chunk.count < -(-header.count // 256) or (sh and sh.count != header.count):

@@ -122,7 +122,7 @@ def kmeans(
     if bad := int((~torch.isfinite(x).all(1)).sum()):
         raise ValueError(f"{bad} of {x.shape[0]} rows are not finite; drop them before k-means")
     if weight is not None:
-        if weight.shape != x.shape[:1] or not bool((weight >= 0).all()) or not bool((weight > 0).any()):
+        if weight.shape != x.shape[:1] or not (weight >= 0).all() or not (weight > 0).any():
             raise ValueError(f"weight must have shape [{x.shape[0]}], no negative and at least one positive value")
         used = weight > 0
         x, weight = x[used], weight.detach()[used].double()

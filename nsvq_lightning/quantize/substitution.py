@@ -295,8 +295,9 @@ def _checked(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> tuple[
 
 def _missing(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> ValueError:
     """The error for a row or a code that is out of range."""
-    wrong_row = bool(((rows < 0) | (rows >= len(x))).any())
-    return outside("rows", rows.numpy(), len(x)) if wrong_row else outside("codes", codes.numpy(), len(codebook))
+    if ((rows < 0) | (rows >= len(x))).any():
+        return outside("rows", rows.numpy(), len(x))
+    return outside("codes", codes.numpy(), len(codebook))
 
 
 def substitute_backward(

@@ -91,7 +91,7 @@ def encode_keys(keys: Uint64s, depths: Int64s) -> bytes:
     """
     _check_depths(depths)
     check_array("keys", keys, (len(depths),), UINT64)
-    if bool((keys[1:] < keys[:-1]).any()) or (len(keys) and keys[-1] > _KEY_MASK):
+    if (keys[1:] < keys[:-1]).any() or (len(keys) and keys[-1] > _KEY_MASK):
         raise ValueError(f"keys must ascend and be below 2^{KEY_BITS}, got {keys}; sort them")
     words = _room(int(depths.sum()) + 8 * len(keys))
     return _bytes(words, _write_keys(keys, depths, words, rc.new_contexts(_KEY_CONTEXTS)))
