@@ -78,6 +78,6 @@ def write_blender(colmap: Path, root: Path) -> Path:
             assert cv2.imwrite(str(root / part / f"r_{number}.png"), np.dstack([photo, alpha]))
             frames.append({"file_path": f"./{part}/r_{number}", "rotation": 0.01,
                            "transform_matrix": opengl_matrix(image.viewmat)})  # fmt: skip
-        angle = 2 * float(np.arctan(side / 2 / camera.params[0]))
+        angle = 2 * float(np.arctan(side / 2 / camera.calibration_matrix()[0, 0]))
         (root / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     return root
