@@ -1,7 +1,5 @@
 """What callbacks share: the check of the module, acting once per step, the folder of the run, the search for NaN."""
 
-import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,6 +12,8 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import hold, is_fast_dev_run, let_go, run_folder
 from nsvq_lightning.training.scene_module import scene_of
 
+from .settings import check_settings
+
 
 class SplatCallback(Callback):
     """Base of the callbacks that train a :class:`nsvq_lightning.SplatModule`.
@@ -23,15 +23,17 @@ class SplatCallback(Callback):
     accumulation Lightning calls the hooks that they come from for every view of the iteration. A subclass that
     overrides ``setup``, or one of these hooks beside its method, calls it here first.
 
-    A callback is a dataclass whose fields are its settings; those that :attr:`state` names are what it has reached, and
-    have ``init=False``. One that overrides ``__post_init__`` calls it here, for the check of the settings.
+    A callback is a dataclass whose fields are its settings: the types of :mod:`nsvq_lightning.callbacks.settings` say
+    what they may be, the text below each is its help. Fields that :attr:`state` names are what it has reached, and have
+    ``init=False``. One that overrides ``__post_init__`` calls it here, for the check of the settings.
+
+    A callback that acts at certain iterations has a method ``is_due(module, iteration)``, and acts where that is true:
+    a subclass changes when by overriding it.
 
     Raises:
         ValueError: A setting is out of its bounds, or not finite.
     """
 
-    bounds: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    """What settings must be unless they are None: each time one of :data:`BOUNDS`, then their names."""
     state: ClassVar[tuple[str, ...]] = ()
     """Attributes that checkpoints carry, and that have the values of the class when a fit starts."""
     passing: ClassVar[tuple[str, ...]] = ()
@@ -39,11 +41,7 @@ class SplatCallback(Callback):
     _acted: ClassVar[dict[str, int]] = {}
 
     def __post_init__(self) -> None:
-        for bound, *names in self.bounds:
-            for name in names:
-                value = getattr(self, name)
-                if value is not None and not (math.isfinite(value) and BOUNDS[bound](value)):
-                    raise ValueError(f"{name} must be {bound}, got {value}")
+        check_settings(self)
 
     def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Check the module, and forget an earlier fit; a checkpoint's state is loaded after this.
@@ -56,7 +54,14 @@ class SplatCallback(Callback):
         if stage == "fit":
             for name in ("_acted", *self.state, *self.passing):
                 vars(self).pop(name, None)
+            # All of them: whichever comes first may need what the last one says.
+            for each in trainer.callbacks:  # type: ignore[attr-defined]  # Lightning does not type it
+                if isinstance(each, SplatCallback):
+                    each.tell(module)
             self.before_fit(trainer, module)
+
+    def tell(self, module: SplatModule) -> None:
+        """Set on the module what other callbacks ask of this one, before any of them acts."""
 
     def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Act when a fit is set up, before its splats are made."""
@@ -92,17 +97,6 @@ class SplatCallback(Callback):
             return False
         vars(self)["_acted"] = self._acted | {hook: iteration}
         return True
-
-
-# What a setting may be, by how an error says it.
-BOUNDS: dict[str, Callable[[float], bool]] = {
-    "at least 1": lambda value: value >= 1,
-    "at least 0": lambda value: value >= 0,
-    "above 0": lambda value: value > 0,
-    "between 0 and 1": lambda value: 0 < value < 1,
-    "in [0, 1)": lambda value: 0 <= value < 1,
-    "in (0, 1]": lambda value: 0 < value <= 1,
-}
 
 
 class WritingCallback(SplatCallback):

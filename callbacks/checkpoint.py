@@ -17,9 +17,9 @@ from nsvq_lightning.io.atomic import atomic_path
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
-from nsvq_lightning.training.schedule import Schedule
 
 from .base import WritingCallback
+from .settings import Whole
 
 log = logging.getLogger(__name__)
 
@@ -108,27 +108,21 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     Several processes stop together after the iteration in which any of them receives a signal. After an exception,
     which comes in the middle of an iteration, the last checkpoint is the one to continue from.
 
-    Args:
-        every: Iterations between two checkpoints; None is a tenth of the schedule, 0 saves only at the end of the run.
-        keep: Also keep each checkpoint as ``step-<iteration>.ckpt``.
-
-    Raises:
-        ValueError: ``every`` is negative.
-
     Example:
+        >>> from nsvq_lightning import SplatModule
         >>> from nsvq_lightning.callbacks import RunCheckpoint
-        >>> from nsvq_lightning.training.schedule import Schedule
-        >>> checkpoint = RunCheckpoint(every=1000)  # --callbacks.checkpoint.every=1000
-        >>> schedule = Schedule(total=4500)
-        >>> [iteration for iteration in range(1, 4501) if checkpoint.is_due(schedule, iteration)]
-        [1000, 1500, 2000, 3000, 4000, 4200, 4500]
+        >>> checkpoint = RunCheckpoint(every=10_000)  # --callbacks.checkpoint.every=10000
+        >>> module = SplatModule(codebooks="4k")
+        >>> [iteration for iteration in range(1, 45_001) if checkpoint.is_due(module, iteration)]
+        [10000, 15000, 20000, 30000, 40000, 43000, 45000]
     """
 
-    bounds = (("at least 0", "every"),)
     passing = ("best_model_path", "_saved")
 
-    every: int | None = None
+    every: Whole | None = None
+    """Iterations between two checkpoints; None is a tenth of the schedule, 0 saves only at the end of the run."""
     keep: bool = False
+    """Also keep each checkpoint as ``step-<iteration>.ckpt``."""
     best_model_path: str = field(default="", init=False)
     """Path of ``last_path`` under the name by which Lightning looks for ``ckpt_path="best"``."""
     _saved: int = field(default=-1, init=False)
@@ -143,13 +137,13 @@ class RunCheckpoint(WritingCallback, Checkpoint):
         """Checkpoint to continue from: the last one written, or at first the one this run was continued from."""
         return Path(self.best_model_path) if self.best_model_path else None
 
-    def is_due(self, schedule: Schedule, iteration: int) -> bool:
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether to save after this iteration; the end of the run is saved separately.
 
         Ends of phases are due, as the next step (placing codebooks, freezing codes) takes longest and cannot be undone.
         """
-        every = schedule.part(10) if self.every is None else self.every
-        return every > 0 and (iteration % every == 0 or iteration in schedule.ends)
+        every = module.schedule.part(10) if self.every is None else self.every
+        return every > 0 and (iteration % every == 0 or iteration in module.schedule.ends)
 
     def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Come after all other checkpoint callbacks, whose best one Lightning then finds."""
@@ -175,7 +169,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
             self._save(trainer, module)
             return
         received = self._stop.received(trainer)
-        if received or self.is_due(module.schedule, iteration):
+        if received or self.is_due(module, iteration):
             self._save(trainer, module)
         self._stop.deliver(received)
 

@@ -23,16 +23,18 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
 from .base import SplatCallback, finite_search_is_due, keep_finite_splats
+from .settings import Count, NonNegative, Opacity, Positive, Whole
 
 log = logging.getLogger(__name__)
 
 
+@dataclass(eq=False, kw_only=True)
 class Densification(SplatCallback, ABC):
     """Base of the callbacks that add and remove splats by what the views of the last iterations have shown.
 
     A subclass names its side tables, asks the module for what a view must bring (:meth:`ask`), adds a view to the
-    tables (:meth:`add`), and acts on them after a complete iteration (:meth:`act`). This class sees to the rest: the
-    views of all processes are added, those whose splats have changed in between are left out with a warning, and
+    tables (:meth:`gradients`), and acts on them after a complete iteration (:meth:`act`). This class sees to the rest:
+    the views of all processes are added, those whose splats have changed in between are left out with a warning, and
     non-finite splats are dropped in every phase.
     """
 
@@ -41,9 +43,9 @@ class Densification(SplatCallback, ABC):
     limit_name: ClassVar[str]
     """What sets :meth:`limit`, for messages."""
 
-    min_splats: int
+    min_splats: Count = 10
     """A pruning that would leave fewer splats is skipped with a warning."""
-    finite_every: int
+    finite_every: Count = 100
     """Iterations between two searches for non-finite splats; a step whose loss is not finite always causes one."""
     passing = ("_warned",)
     _warned = _counts = False
@@ -180,69 +182,49 @@ class DensityControl(Densification):
 
     Iterations are those of the reference run; :class:`~nsvq_lightning.training.schedule.Schedule` scales them.
 
-    Args:
-        max_splats: Upper limit on the number of splats. If the scene starts with more, those that contribute most to
-            the train views are kept; during growth, those with the largest statistic come first. None for no limit, as
-            in the paper.
-        start: First iteration that clones and splits.
-        last: Last iteration that clones and splits.
-        every: Interval of cloning and splitting.
-        grad_threshold: A splat is cloned or split where the norm of its screen-space gradient (in normalised device
-            coordinates), averaged over the views that saw it, reaches this.
-        dense_fraction: Splats up to this share of the extent are cloned, larger ones split.
-        shrink: The two children of a split are smaller than their parent by this factor.
-        min_opacity: Splats with a lower opacity are pruned.
-        huge_fraction: Splats larger than this share of the extent are pruned.
-        huge_after: Huge splats are pruned only after this iteration.
-        reset_every: Interval of opacity resets.
-        reset_last: Last opacity reset.
-        reset_opacity: Opacities are reset to at most this.
-        white_reset: Iteration of one more reset on a white background; 0 for none.
-        prune_start: First pruning of the prune phase.
-        prune_last: Last pruning of the prune phase.
-        prune_every: Interval of pruning in the prune phase; 0 never prunes.
-        min_splats: A pruning that would leave fewer splats is skipped with a warning.
-        finite_every: Iterations between two searches for non-finite splats; a step whose loss is not finite always
-            causes one.
-
     Raises:
-        ValueError: A setting is out of range.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import DensityControl, standard
-        >>> callbacks = standard(density=DensityControl(max_splats=200_000))  # --callbacks.density.max_splats=200000
-        >>> [callback.max_splats for callback in callbacks if isinstance(callback, DensityControl)]
-        [200000]
+        ValueError: ``max_splats`` is below ``min_splats``.
     """
 
     tables: ClassVar[tuple[str, ...]] = ("gradient_sum", "view_count")
     limit_name: ClassVar[str] = "max_splats"
-    bounds = (
-        ("at least 1", "start", "every", "reset_every", "min_splats", "finite_every"),
-        ("at least 0", "white_reset", "prune_every", "huge_after", "grad_threshold", "dense_fraction"),
-        ("above 0", "shrink", "huge_fraction"),
-        ("between 0 and 1", "min_opacity", "reset_opacity"),
-    )
 
     max_splats: int | None = None
-    start: int = 600
+    """Upper limit on the number of splats. If the scene starts with more, those that contribute most to the train views
+    are kept; during growth, those with the largest statistic come first. None for no limit, as in the paper."""
+    start: Count = 600
+    """First iteration that clones and splits."""
     last: int = 14_900
-    every: int = 100
-    grad_threshold: float = 2e-4
-    dense_fraction: float = 0.01
-    shrink: float = 1.6
-    min_opacity: float = 0.005
-    huge_fraction: float = 0.1
-    huge_after: int = 3000
-    reset_every: int = 3000
+    """Last iteration that clones and splits."""
+    every: Count = 100
+    """Interval of cloning and splitting."""
+    grad_threshold: NonNegative = 2e-4
+    """A splat is cloned or split where the norm of its screen-space gradient (in normalised device coordinates),
+    averaged over the views that saw it, reaches this."""
+    dense_fraction: NonNegative = 0.01
+    """Splats up to this share of the extent are cloned, larger ones split."""
+    shrink: Positive = 1.6
+    """The two children of a split are smaller than their parent by this factor."""
+    min_opacity: Opacity = 0.005
+    """Splats with a lower opacity are pruned."""
+    huge_fraction: Positive = 0.1
+    """Splats larger than this share of the extent are pruned."""
+    huge_after: Whole = 3000
+    """Huge splats are pruned only after this iteration."""
+    reset_every: Count = 3000
+    """Interval of opacity resets."""
     reset_last: int = 12_000
-    reset_opacity: float = 0.01
-    white_reset: int = 500
+    """Last opacity reset."""
+    reset_opacity: Opacity = 0.01
+    """Opacities are reset to at most this."""
+    white_reset: Whole = 500
+    """Iteration of one more reset on a white background; 0 for none."""
     prune_start: int = 16_000
+    """First pruning of the prune phase."""
     prune_last: int = 20_000
-    prune_every: int = 1000
-    min_splats: int = 10
-    finite_every: int = 100
+    """Last pruning of the prune phase."""
+    prune_every: Whole = 1000
+    """Interval of pruning in the prune phase; 0 never prunes."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -262,25 +244,36 @@ class DensityControl(Densification):
         """The screen-space gradients."""
         return render.means2d.grad
 
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
+        """Whether splats are cloned, split and pruned or, in the prune phase, pruned after this iteration."""
+        schedule = module.schedule
+        phase = schedule.phase_at(iteration)
+        if phase is Phase.WARMUP:
+            return iteration in schedule.density_times(self.start, self.last, self.every)
+        if phase is Phase.PRUNE and self.prune_every:
+            return iteration in schedule.times(self.prune_start, self.prune_last, self.prune_every)
+        return False
+
+    def is_reset_due(self, module: SplatModule, iteration: int) -> bool:
+        """Whether opacities are reset after this iteration of the warm-up phase."""
+        schedule = module.schedule
+        on_white = module.background == "white" and self.white_reset > 0
+        first = on_white and iteration == schedule.iteration(self.white_reset)
+        return first or iteration in schedule.reset_times(self.reset_last, self.reset_every)
+
     def act(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Clone, split, prune and reset when due."""
-        schedule, phase = module.schedule, module.schedule.phase_at(iteration)
-        if phase is Phase.WARMUP:
-            if iteration in schedule.density_times(self.start, self.last, self.every):
-                added = self._grow(trainer, module, iteration)
-                pruned = self._prune(trainer, module, huge=iteration > schedule.iteration(self.huge_after))
-                distributed.check_replicas(trainer, "density control")
-                log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
-            on_white = module.background == "white" and self.white_reset
-            first = bool(on_white) and iteration == schedule.iteration(self.white_reset)
-            if first or iteration in schedule.reset_times(self.reset_last, self.reset_every):
-                self.reset_opacities(trainer, module, self.reset_opacity)
-        prune_times = schedule.times(self.prune_start, self.prune_last, self.prune_every) if self.prune_every else ()
-        if phase is Phase.PRUNE and iteration in prune_times:
-            pruned = self._prune(trainer, module, huge=False)
-            distributed.check_replicas(trainer, "pruning")
-            level = logging.INFO if pruned else logging.DEBUG
-            log.log(level, "iteration %d: pruned %d splats, %d remain", iteration, pruned, len(module.splats))
+        schedule = module.schedule
+        growing = schedule.phase_at(iteration) is Phase.WARMUP
+        if self.is_due(module, iteration):
+            added = self._grow(trainer, module, iteration) if growing else 0
+            huge = growing and iteration > schedule.iteration(self.huge_after)
+            pruned = self._prune(trainer, module, huge=huge)
+            distributed.check_replicas(trainer, "density control")
+            level = logging.INFO if pruned and not growing else logging.DEBUG
+            log.log(level, "iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
+        if growing and self.is_reset_due(module, iteration):
+            self.reset_opacities(trainer, module, self.reset_opacity)
 
     @torch.no_grad()
     def _grow(self, trainer: Trainer, module: SplatModule, iteration: int) -> int:

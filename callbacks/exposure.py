@@ -13,6 +13,7 @@ from nsvq_lightning.training import distributed, scene_module
 from nsvq_lightning.training.module import LossTerm, SplatModule
 
 from .base import SplatCallback, has_gradients
+from .settings import Positive
 
 log = logging.getLogger(__name__)
 
@@ -29,25 +30,12 @@ class ExposureCompensation(SplatCallback):
     Test views are rendered as they are: nobody knows their exposure. Their ``cc_psnr`` and ``cc_ssim`` in
     ``metrics.json`` are measured after a colour correction to the photo
     (:func:`nsvq_lightning.quality.metrics.color_corrected`).
-
-    Args:
-        rate: Learning rate at the start.
-        final: Its factor at the end; it falls exponentially.
-
-    Raises:
-        ValueError: ``rate`` or ``final`` is not positive and finite.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import ExposureCompensation, standard
-        >>> callbacks = [*standard(), ExposureCompensation()]  # --trainer.callbacks+=ExposureCompensation
-        >>> callbacks[-1].rate
-        0.001
     """
 
-    bounds = (("above 0", "rate", "final"),)
-
-    rate: float = 0.001
-    final: float = 0.1
+    rate: Positive = 0.001
+    """Learning rate at the start."""
+    final: Positive = 0.1
+    """Its factor at the end; it falls exponentially."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

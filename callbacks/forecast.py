@@ -16,7 +16,7 @@ from nsvq_lightning.training import optim, scene_module
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Schedule
 
-from .growth import BudgetedGrowth, splats_for_photos
+from .growth import splats_for_photos
 
 # An iteration of a run over a step as it is measured here: what callbacks, codebooks and the loop take.
 LOOP = 1.3
@@ -74,24 +74,8 @@ def grown(scene: Scene, count: int) -> Splats:
 PAPER_SPLATS = 4.0
 
 
-def stretches(schedule: Schedule, growth: BudgetedGrowth, first: int, budget: int) -> list[tuple[float, int]]:
-    """Shares of a run, and how many splats it has in them on average: while it grows, fully grown, after the selection.
-
-    Args:
-        schedule: Phases of the run.
-        growth: Its density control.
-        first: Splats at the start.
-        budget: Splats at the end.
-    """
-    warmup = schedule.share(schedule.warmup_end)
-    full = min(schedule.share(growth.full), warmup)
-    most = round(growth.overshoot * budget)
-    grows = round(first + (most - first) * 2 / 3)  # along the root of the time
-    return [(full, grows), (warmup - full, most), (1 - warmup, budget)]
-
-
 def iteration_seconds(scene: Scene, parts: list[tuple[float, int]], device: torch.device | str = "cpu") -> float:
-    """Mean time of an iteration of a run with :func:`stretches`."""
+    """Mean time of an iteration of a run with so many splats in each share of its time."""
     return LOOP * sum(share * step_seconds(scene, count, device) for share, count in parts if share > 0)
 
 
@@ -100,19 +84,18 @@ def iterations_within(minutes: float, trainer: Trainer, module: SplatModule, sch
 
     Args:
         minutes: Time to train.
-        trainer: Its data module has the scene, its callbacks say how splats grow.
-        module: With its budget.
+        trainer: Its data module has the scene.
+        module: Has its budget, and says how splats grow.
         schedule: Phases of a run of any length.
 
     Raises:
         ValueError: The trainer has no data module with a scene.
     """
     scene = scene_module.needed_scene(trainer, "minutes are measured on the photos", "give trainer.max_steps")
-    growth = next((each for each in trainer.callbacks if isinstance(each, BudgetedGrowth)), None)  # type: ignore[attr-defined]
     budget = module.splat_budget
-    if growth is None or budget is None:
+    if module.stretches is None or budget is None:
         parts = [(1.0, budget or round(PAPER_SPLATS * splats_for_photos(len(scene.train), detailed_pixels(scene))))]
     else:
-        parts = stretches(schedule, growth, max(len(scene.points), module.first_points or 0), budget)
+        parts = module.stretches(schedule, max(len(scene.points), module.first_points or 0), budget)
     seconds = trainer.accumulate_grad_batches * iteration_seconds(scene, parts, trainer.strategy.root_device)
     return int(trainer.strategy.broadcast(max(1, round(60 * minutes / seconds))))

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from lightning.pytorch import Trainer
@@ -23,11 +23,11 @@ from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, codebo
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training import distributed, scene_module
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.training.schedule import Phase, Schedule
 
 from .base import SplatCallback
 from .density import Densification
-from .quantization import RateDistortion
+from .settings import ABOVE_0, AT_LEAST_1, Count, NonNegative, Opacity, Positive, Share, Whole
 
 log = logging.getLogger(__name__)
 
@@ -40,29 +40,19 @@ class SplatBudget(SplatCallback):
     :class:`~nsvq_lightning.callbacks.SplatSelection` removes what is above it. Without a number of splats or bytes it
     comes from the photos.
 
-    Args:
-        quality: Times the default for the photos (:func:`nsvq_lightning.callbacks.growth.splats_for_photos`).
-        splats: Number of splats.
-        bytes: Size of the file at level ``compact``.
-        start: Points to start with, as a share of the number of splats: those of SfM, and as many more as that takes
-            from the flow between photos (:func:`nsvq_lightning.data.dense_start.dense_points`); 0 for those of SfM.
-
     Raises:
-        ValueError: Splats and bytes are both given, or a number is not above 0.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import SplatBudget, standard
-        >>> callbacks = standard(budget=SplatBudget(splats=100_000))  # --splats 100000
-        >>> [callback.splats for callback in callbacks if isinstance(callback, SplatBudget)]
-        [100000]
+        ValueError: Splats and bytes are both given.
     """
 
-    bounds = (("above 0", "quality", "splats", "bytes"), ("at least 0", "start"))
-
-    quality: float = 1.0
-    splats: int | None = None
-    bytes: int | None = None
-    start: float = 0.8
+    quality: Positive = 1.0
+    """Times the default for the photos (:func:`nsvq_lightning.callbacks.growth.splats_for_photos`)."""
+    splats: Annotated[int, ABOVE_0] | None = None
+    """Number of splats."""
+    bytes: Annotated[int, ABOVE_0] | None = None
+    """Size of the file at level ``compact``."""
+    start: NonNegative = 0.8
+    """Points to start with, as a share of the number of splats: those of SfM, and as many more as that takes from the
+    flow between photos (:func:`nsvq_lightning.data.dense_start.dense_points`); 0 for those of SfM."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -79,8 +69,7 @@ class SplatBudget(SplatCallback):
         budget, reason = self.splats or 0, "as asked"
         if self.bytes is not None:
             codebooks = {name: tuple(quantizer.codebook.shape) for name, quantizer in module.quantizers.items()}
-            choices = [c.strength for c in trainer.callbacks if isinstance(c, RateDistortion)]  # type: ignore[attr-defined]
-            stored = module.splats.sh_degree, module.storage.precision, max(choices, default=0.0)
+            stored = module.splats.sh_degree, module.storage.precision, module.rate_strength
             budget = splats_for_bytes(self.bytes, codebooks, *stored)
             reason = f"for a file of {self.bytes} bytes"
         elif self.splats is None:
@@ -142,71 +131,52 @@ class BudgetedGrowth(Densification):
 
     Iterations are those of the reference run; :class:`~nsvq_lightning.training.schedule.Schedule` scales them.
 
-    Args:
-        budget: How many splats the scene is to have in the end; None for the module's
-            (:class:`nsvq_lightning.callbacks.SplatBudget`).
-        overshoot: Growth may reach this many times the budget: more than 1 is for a run that selects the best of them
-            afterwards (:class:`nsvq_lightning.callbacks.SplatSelection`).
-        start: Iteration at which growth may begin.
-        full: Iteration at which the number of splats may reach the budget; between the two it may grow with the root of
-            the time. From here on the gradient itself is a splat's weight.
-        every: Interval of growth.
-        grad_threshold: A splat may be split where its absolute screen-space gradient (in normalised device
-            coordinates), averaged over the views that saw it, reaches this.
-        late_threshold: The same after ``full``.
-        min_opacity: Splats with a lower opacity are pruned at each growth but the last.
-        first_prune: Iteration at which opacities below ``first_opacity`` are pruned once; 0 for never.
-        first_opacity: See ``first_prune``.
-        reset_every: Interval of opacity resets.
-        reset_last: Last opacity reset; 0 for none. Long runs need them (docs/recipe.md).
-        reset_opacity: Opacities are reset to at most this.
-        recovery: Iterations after a reset at which those with the lowest opacity are pruned.
-        recoveries: After how many resets, from the first, that is done.
-        recovery_share: Share of the splats that this prunes.
-        patience: After so many times at which there is room, but hardly a splat over the threshold, the warm-up phase
-            ends; 0 for never.
-        min_splats: A pruning that would leave fewer splats is skipped with a warning.
-        finite_every: Iterations between two searches for non-finite splats; a step whose loss is not finite always
-            causes one.
-
     Raises:
-        ValueError: A setting is out of range.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import BudgetedGrowth, standard
-        >>> callbacks = standard(density=BudgetedGrowth(budget=100_000))  # --callbacks.density=BudgetedGrowth ...
-        >>> [callback.budget for callback in callbacks if isinstance(callback, BudgetedGrowth)]
-        [100000]
+        ValueError: ``budget`` is below ``min_splats``, or ``full`` is not after ``start``.
     """
 
     tables: ClassVar[tuple[str, ...]] = ("gradient_sum", "view_count", "edge_sum")
     limit_name: ClassVar[str] = "the budget"
-    bounds = (
-        ("at least 1", "every", "reset_every", "recovery", "min_splats", "overshoot", "finite_every"),
-        ("at least 0", "start", "first_prune", "recoveries", "patience", "grad_threshold", "late_threshold"),
-        ("between 0 and 1", "min_opacity", "first_opacity", "reset_opacity"),
-        ("in [0, 1)", "recovery_share"),
-    )
 
     budget: int | None = None
-    overshoot: float = 2.0
-    start: int = 0
+    """How many splats the scene is to have in the end; None for the module's
+    (:class:`nsvq_lightning.callbacks.SplatBudget`)."""
+    overshoot: Annotated[float, AT_LEAST_1] = 2.0
+    """Growth may reach this many times the budget: more than 1 is for a run that selects the best of them afterwards
+    (:class:`nsvq_lightning.callbacks.SplatSelection`)."""
+    start: Whole = 0
+    """Iteration at which growth may begin."""
     full: int = 6200
-    every: int = 100
-    grad_threshold: float = 3e-4
-    late_threshold: float = 2e-4
-    min_opacity: float = 0.005
-    first_prune: int = 300
-    first_opacity: float = 0.02
-    reset_every: int = 2600
+    """Iteration at which the number of splats may reach the budget; between the two it may grow with the root of the
+    time. From here on the gradient itself is a splat's weight."""
+    every: Count = 100
+    """Interval of growth."""
+    grad_threshold: NonNegative = 3e-4
+    """A splat may be split where its absolute screen-space gradient (in normalised device coordinates), averaged over
+    the views that saw it, reaches this."""
+    late_threshold: NonNegative = 2e-4
+    """The same after ``full``."""
+    min_opacity: Opacity = 0.005
+    """Splats with a lower opacity are pruned at each growth but the last."""
+    first_prune: Whole = 300
+    """Iteration at which opacities below ``first_opacity`` are pruned once; 0 for never."""
+    first_opacity: Opacity = 0.02
+    """See ``first_prune``."""
+    reset_every: Count = 2600
+    """Interval of opacity resets."""
     reset_last: int = 0
-    reset_opacity: float = 0.05
-    recovery: int = 600
-    recoveries: int = 2
-    recovery_share: float = 0.2
-    patience: int = 5
-    min_splats: int = 10
-    finite_every: int = 100
+    """Last opacity reset; 0 for none. Long runs need them (docs/recipe.md)."""
+    reset_opacity: Opacity = 0.05
+    """Opacities are reset to at most this."""
+    recovery: Count = 600
+    """Iterations after a reset at which those with the lowest opacity are pruned."""
+    recoveries: Whole = 2
+    """After how many resets, from the first, that is done."""
+    recovery_share: Share = 0.2
+    """Share of the splats that this prunes."""
+    patience: Whole = 5
+    """After so many times at which there is room, but hardly a splat over the threshold, the warm-up phase ends; 0 for
+    never."""
     state = ("idle",)
     idle: int = field(default=0, init=False)
     """How many times in a row hardly a splat had to be split."""
@@ -218,6 +188,24 @@ class BudgetedGrowth(Densification):
             raise ValueError(f"growth must be full after its start={self.start}, got full={self.full}")
         if self.budget is not None and self.budget < self.min_splats:
             raise ValueError(f"budget must be at least min_splats={self.min_splats}, got {self.budget}")
+
+    def tell(self, module: SplatModule) -> None:
+        """Tell how splats grow."""
+        module.stretches = self.stretches
+
+    def stretches(self, schedule: Schedule, first: int, budget: int) -> list[tuple[float, int]]:
+        """Shares of a run, and how many splats it has in them on average: while it grows, fully grown, at the budget.
+
+        Args:
+            schedule: Phases of the run.
+            first: Splats at the start.
+            budget: Splats at the end, after their selection.
+        """
+        warmup = schedule.share(schedule.warmup_end)
+        full = min(schedule.share(self.full), warmup)
+        most = round(self.overshoot * budget)
+        grows = round(first + (most - first) * 2 / 3)  # along the root of the time
+        return [(full, grows), (warmup - full, most), (1 - warmup, budget)]
 
     def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Find the photos of the scene, which know their edges."""
@@ -252,6 +240,13 @@ class BudgetedGrowth(Densification):
         """The absolute gradients and edge weights."""
         return None if render.absgrad is None else render.absgrad.grad
 
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
+        """Whether splats are split after this iteration."""
+        schedule = module.schedule
+        last = round(schedule.reference(schedule.ends[Phase.WARMUP]))
+        times = schedule.density_times(self.start + self.every, last, self.every)
+        return schedule.phase_at(iteration) is Phase.WARMUP and iteration in times
+
     def act(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Split, prune and reset when due."""
         schedule = module.schedule
@@ -259,28 +254,32 @@ class BudgetedGrowth(Densification):
             return
         if self.first_prune and iteration == schedule.iteration(self.first_prune):
             self.prune(trainer, module, module.splats.opacities.sigmoid() < self.first_opacity)
-        last = schedule.ends[Phase.WARMUP]
-        times = schedule.density_times(self.start + self.every, round(schedule.reference(last)), self.every)
-        if iteration in times:
-            room, added = self._grow(trainer, module, iteration)
-            pruned = 0
-            if iteration != times[-1]:
-                pruned = self.prune(trainer, module, module.splats.opacities.sigmoid() < self.min_opacity)
-            distributed.check_replicas(trainer, "growth")
-            log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
-            self.idle = self.idle + 1 if added <= IDLE * min(room, len(module.splats)) else 0
-            if self.idle >= self.patience > 0:
-                module.schedule = replace(schedule, saved=schedule.saved + last - iteration)
-                log.info(
-                    f"iteration {iteration}: growth ends with {len(module.splats)} splats, as hardly any needs to be "
-                    f"split; the run will be {last - iteration} iterations shorter"
-                )
+        if self.is_due(module, iteration):
+            self._split_and_prune(trainer, module, iteration)
         resets = schedule.reset_times(self.reset_last, self.reset_every)
         if iteration in resets:
             self.reset_opacities(trainer, module, self.reset_opacity)
         if iteration in (reset + schedule.interval(self.recovery) for reset in resets[: self.recoveries]):
             transparency = -module.splats.opacities
             self.prune(trainer, module, most_contributing(transparency, int(self.recovery_share * len(transparency))))
+
+    def _split_and_prune(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
+        """Split, prune unless it is the last time, and end the phase where splitting has become idle."""
+        schedule = module.schedule
+        last = schedule.ends[Phase.WARMUP]
+        room, added = self._grow(trainer, module, iteration)
+        pruned = 0
+        if any(self.is_due(module, later) for later in range(iteration + 1, last + 1)):
+            pruned = self.prune(trainer, module, module.splats.opacities.sigmoid() < self.min_opacity)
+        distributed.check_replicas(trainer, "growth")
+        log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
+        self.idle = self.idle + 1 if added <= IDLE * min(room, len(module.splats)) else 0
+        if self.idle >= self.patience > 0:
+            module.schedule = replace(schedule, saved=schedule.saved + last - iteration)
+            log.info(
+                f"iteration {iteration}: growth ends with {len(module.splats)} splats, as hardly any needs to be "
+                f"split; the run will be {last - iteration} iterations shorter"
+            )
 
     @torch.no_grad()
     def _grow(self, trainer: Trainer, module: SplatModule, iteration: int) -> tuple[int, int]:

@@ -33,22 +33,12 @@ class ExportScene(WritingCallback):
     The compressed scene is ``scene.nsvq``, and ``scene.ply`` has its decoded splats, for any viewer. With
     ``scene.nsvq`` comes ``viewer.html``, a page that holds it and shows it in a browser.
 
-    Args:
-        formats: Suffixes without the dot; ``sog``, ``spz`` and ``splat`` are smaller files for viewers.
-
     Raises:
         ValueError: An unknown format.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import ExportScene
-        >>> ExportScene(["nsvq", "sog"]).formats  # --callbacks.export.formats=[nsvq,sog]
-        ('nsvq', 'sog')
-        >>> ExportScene(["obj"])  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ValueError: unknown export formats obj; choose from ply, nsvq, sog, ...
     """
 
     formats: Sequence[str] = ("nsvq", "ply")
+    """Suffixes without the dot; ``sog``, ``spz`` and ``splat`` are smaller files for viewers."""
 
     def __post_init__(self) -> None:
         known = [suffix.removeprefix(".") for suffix, entry in FORMATS.items() if entry.write]
@@ -84,12 +74,6 @@ class RenderWriter(BasePredictionWriter):
 
     Args:
         folder: Where; None is ``predictions`` in the folder of the run.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import RenderWriter, standard
-        >>> writer = RenderWriter(folder="views")  # --callbacks.predictions.folder=views
-        >>> [callback.folder for callback in standard(predictions=writer) if isinstance(callback, RenderWriter)]
-        ['views']
     """
 
     def __init__(self, folder: str | None = None) -> None:
@@ -131,11 +115,6 @@ class LiveScene(WritingCallback):
     It writes them into the folder of the run when somebody asks, and not otherwise. They are those that a file written
     at that moment would hold, stored without loss in ``live.nsvq``. At most a twentieth of the time goes into it, and
     none of that counts as training time. The file goes when the run ends.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import STANDARD, LiveScene
-        >>> STANDARD["live"] is LiveScene  # --callbacks.live=null leaves it out
-        True
     """
 
     _running, _answered, _next = False, 0, 0.0

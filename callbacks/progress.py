@@ -26,13 +26,6 @@ class SplatProgressBar(TQDMProgressBar):
 
     Args:
         refresh_rate: Iterations between two refreshes on a terminal; 0 turns the bar off.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import SplatProgressBar
-        >>> SplatProgressBar(refresh_rate=100).is_disabled  # --callbacks.progress.refresh_rate=100
-        False
-        >>> SplatProgressBar(refresh_rate=0).is_disabled
-        True
     """
 
     BAR_FORMAT = "|{bar}| {n_fmt}/{total_fmt} {remaining} to {eta:%H:%M}{postfix}"

@@ -7,12 +7,14 @@ import torch
 from lightning.pytorch import Trainer
 
 from nsvq_lightning.compression.importance import below_cap, likely_effects, most_contributing
-from nsvq_lightning.data.scene import View
 from nsvq_lightning.training import distributed, row_ops, scene_module
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
 from .base import SplatCallback
+from .settings import Count, NonNegative
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(eq=False)
@@ -23,12 +25,6 @@ class OpacityRegularization(SplatCallback):
     fewer iterations for splats to fade, and a proportionally larger λ
     (:meth:`nsvq_lightning.training.schedule.Schedule.strength`).
 
-    Args:
-        weight: λ of the reference run.
-
-    Raises:
-        ValueError: λ is negative or not finite.
-
     Example:
         >>> from nsvq_lightning.callbacks import OpacityRegularization
         >>> from nsvq_lightning.training.schedule import Schedule
@@ -37,19 +33,20 @@ class OpacityRegularization(SplatCallback):
         2e-06
     """
 
-    bounds = (("at least 0", "weight"),)
+    weight: NonNegative = 1e-7
+    """λ of the reference run."""
 
-    weight: float = 1e-7
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
+        """Whether the loss of this iteration has the term."""
+        return module.schedule.phase_at(iteration) is Phase.PRUNE
 
-    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
+    def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Turn the term on and off."""
         module.loss_terms.pop("opacity", None)
-        if module.schedule.phase_at(trainer.global_step + 1) is Phase.PRUNE:
+        if self.is_due(module, iteration):
             weight = module.schedule.strength(self.weight)
             module.loss_terms["opacity"] = lambda *_: weight * module.splats.opacities.sigmoid().sum()
 
-
-log = logging.getLogger(__name__)
 
 # Most train views in which the effect of splats is measured.
 VIEWS = 64
@@ -66,33 +63,23 @@ class SplatSelection(SplatCallback):
 
     It works after any density control, and on a finished scene: ``--model.init_from=scene.ply
     --callbacks.density=null --callbacks.phases.warmup_end=0``.
-
-    Args:
-        budget: How many splats are to be left; None for the module's
-            (:class:`nsvq_lightning.callbacks.SplatBudget`).
-
-    Raises:
-        ValueError: The budget is below 1.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import SplatSelection, standard
-        >>> callbacks = standard(selection=SplatSelection(budget=50_000))  # --callbacks.selection.budget=50000
-        >>> [callback.budget for callback in callbacks if isinstance(callback, SplatSelection)]
-        [50000]
     """
 
-    bounds = (("at least 1", "budget"),)
+    budget: Count | None = None
+    """How many splats are to be left; None for the module's (:class:`nsvq_lightning.callbacks.SplatBudget`)."""
 
-    budget: int | None = None
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
+        """Whether splats are selected before this iteration."""
+        return iteration == module.schedule.first_of(Phase.PRUNE)
 
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        """Select when the phase starts.
+        """Select when due.
 
         Raises:
             ValueError: There are splats to be removed, and the trainer has no data module with a scene.
         """
         budget, count = module.splat_budget if self.budget is None else self.budget, len(module.splats)
-        if iteration != module.schedule.first_of(Phase.PRUNE) or budget is None or count <= budget:
+        if budget is None or count <= budget or not self.is_due(module, iteration):
             return
         splats = below_cap(module.splats.raw())
         views = scene_module.train_sensitivities(trainer, module, splats, VIEWS)

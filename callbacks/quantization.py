@@ -24,6 +24,7 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
 from .base import SplatCallback, finite_search_is_due, keep_finite_splats
+from .settings import Count, Factor, Positive
 
 log = logging.getLogger(__name__)
 
@@ -39,12 +40,6 @@ class CanonicalCovariance(SplatCallback):
 
     With 4k codes on 187 k splats, right after k-means for scales and rotations, test PSNR was 30.47 dB without and
     31.17 dB with it, against 31.64 dB unquantized.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import CanonicalCovariance, standard
-        >>> callbacks = standard(canonical=None)  # --callbacks.canonical=null
-        >>> any(isinstance(callback, CanonicalCovariance) for callback in callbacks)
-        False
     """
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
@@ -52,11 +47,14 @@ class CanonicalCovariance(SplatCallback):
         if self._first_time("after", trainer.global_step):
             self.after_step(trainer, module, trainer.global_step)
 
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
+        """Whether it is the last iteration before the quantize phase, whose first one all callbacks may handle."""
+        return iteration + 1 == module.schedule.first_of(Phase.QUANTIZE)
+
     @torch.no_grad()
     def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        """Act after the last iteration before the quantize phase, so before any callback handles its first one."""
-        first, quantized = module.schedule.first_of(Phase.QUANTIZE), {"scales", "quats"} & set(module.quantizers)
-        if not quantized or first is None or iteration != first - 1:
+        """Act when due, if scales or rotations are quantized."""
+        if module.quantizers.keys().isdisjoint(("scales", "quats")) or not self.is_due(module, iteration):
             return
         optimizer, splats = trainer.optimizers[0], module.splats
         new = canonical(splats.scales.detach(), splats.quats.detach())
@@ -77,38 +75,32 @@ class CodebookInit(SplatCallback):
 
     NaN and infinite splats are dropped first, whenever they were last searched for.
 
-    Args:
-        weights: Weight of a splat in k-means: ``none`` weights all equally, as in the paper; ``contribution`` weights
-            each by its blending weight in the train views, so that codes go to visible splats. Scales stay
-            unweighted: small splats contribute little, but a small splat with the code of larger ones is visible.
-            Right after k-means with 4k codes on 187 k splats, weighting changed test PSNR by -0.37 dB for scales, +0.07
-            for rotations, +0.04 for colours and +0.15 for SH.
-        values_per_splat: Largest K·D of a codebook for each splat; None has no limit. A value takes 4 to 5 bits in the
-            file, so 1024 codes of 45 values for 36 000 splats take as much as they save.
-
     Raises:
-        ValueError: Unknown weights, or ``values_per_splat`` is not above 0.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import CodebookInit, standard
-        >>> callbacks = standard(codebook_init=CodebookInit(weights="none"))  # --callbacks.codebook_init.weights=none
-        >>> [callback.weights for callback in callbacks if isinstance(callback, CodebookInit)]
-        ['none']
+        ValueError: Unknown weights.
     """
 
-    bounds = (("above 0", "values_per_splat"),)
-
     weights: Literal["none", "contribution"] = "contribution"
-    values_per_splat: float | None = None
+    """Weight of a splat in k-means: ``none`` weights all equally, as in the paper; ``contribution`` weights each by its
+    blending weight in the train views, so that codes go to visible splats. Scales stay unweighted: small splats
+    contribute little, but a small splat with the code of larger ones is visible. Right after k-means with 4k codes on
+    187 k splats, weighting changed test PSNR by -0.37 dB for scales, +0.07 for rotations, +0.04 for colours and +0.15
+    for SH."""
+    values_per_splat: Positive | None = None
+    """Largest K·D of a codebook for each splat; None has no limit. A value takes 4 to 5 bits in the file, so 1024 codes
+    of 45 values for 36 000 splats take as much as they save."""
 
     def __post_init__(self) -> None:
         if self.weights not in ("none", "contribution"):
             raise ValueError(f"weights must be 'none' or 'contribution', got {self.weights!r}")
         super().__post_init__()
 
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
+        """Whether codebooks are placed before this iteration."""
+        return iteration == module.schedule.first_of(Phase.QUANTIZE)
+
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        """Fit when the quantize phase starts."""
-        if iteration != module.schedule.first_of(Phase.QUANTIZE):
+        """Fit when due."""
+        if not self.is_due(module, iteration):
             return
         keep_finite_splats(trainer, module)
         weighted = self.weights == "contribution"
@@ -137,19 +129,8 @@ class CodebookReplacement(SplatCallback):
     smaller ``end`` leaves them time. Untrained copies equal their originals, which keep all the rows. Few codes are
     affected: after k-means on 182 k splats, 0 to 5 of 16 384 codes were inactive in a window.
 
-    Args:
-        start: First replacement.
-        early_end: Last one of the early series.
-        early_every: Interval of the early series.
-        end: Last one of the late series.
-        late_every: Interval of the late series.
-        jitter: None copies random active codes, as in the paper. A number in (0, 1] splits the codes that distort most:
-            a row of the scene is drawn with probability proportional to its squared distance to its code, and the new
-            code is put this share of the way from that code to the row.
-        reset_moments: Zero Adam's moments of replaced codes, instead of keeping the old ones.
-
     Raises:
-        ValueError: The iterations are not in ascending order, an interval is below 1, or the jitter is not in (0, 1].
+        ValueError: The iterations are not in ascending order.
 
     Example:
         >>> from nsvq_lightning import SplatModule
@@ -163,15 +144,22 @@ class CodebookReplacement(SplatCallback):
         (2050, 2100, 3900)
     """
 
-    bounds = (("in (0, 1]", "jitter"), ("at least 1", "start", "early_every", "late_every"))
-
-    start: int = 10_700
+    start: Count = 10_700
+    """First replacement."""
     early_end: int = 11_500
-    early_every: int = 200
+    """Last one of the early series."""
+    early_every: Count = 200
+    """Interval of the early series."""
     end: int = 12_000
-    late_every: int = 200
-    jitter: float | None = 0.5
+    """Last one of the late series."""
+    late_every: Count = 200
+    """Interval of the late series."""
+    jitter: Factor | None = 0.5
+    """None copies random active codes, as in the paper. A number in (0, 1] splits the codes that distort most: a row of
+    the scene is drawn with probability proportional to its squared distance to its code, and the new code is put this
+    share of the way from that code to the row."""
     reset_moments: bool = True
+    """Zero Adam's moments of replaced codes, instead of keeping the old ones."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -238,13 +226,6 @@ class CodebookRefit(SplatCallback):
     A refit comes between backward pass and update: once a step, also with gradient accumulation, and before other
     callbacks replace codes or evaluate, so the order of the callbacks does not matter.
 
-    Args:
-        every: Iterations of the reference run between two refits.
-        steps: Lloyd steps of a refit.
-
-    Raises:
-        ValueError: ``every`` or ``steps`` is below 1.
-
     Example:
         >>> from nsvq_lightning import SplatModule
         >>> from nsvq_lightning.callbacks import CodebookRefit
@@ -255,10 +236,10 @@ class CodebookRefit(SplatCallback):
         [25000, 30000, 35000, 40000]
     """
 
-    bounds = (("at least 1", "every", "steps"),)
-
-    every: int = 100
-    steps: int = 10
+    every: Count = 100
+    """Iterations of the reference run between two refits."""
+    steps: Count = 10
+    """Lloyd steps of a refit."""
 
     def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether codebooks are refitted in this iteration."""
@@ -310,50 +291,38 @@ class RateDistortion(SplatCallback):
     before, and the codes that splats have in the end are frozen.
 
     Only quantizers that can hold codes (:meth:`nsvq_lightning.quantize.CodebookQuantizer.hold`) take part.
-
-    Args:
-        strength: Per cent of squared error worth one per cent of the file.
-
-    Raises:
-        ValueError: ``strength`` is not above 0 or not finite.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import RateDistortion, standard
-        >>> callbacks = standard(rate_distortion=RateDistortion(strength=1.0))  # --callbacks.rate_distortion.strength=1
-        >>> [callback.strength for callback in callbacks if isinstance(callback, RateDistortion)]
-        [1.0]
     """
 
     state = ("prices",)
-    bounds = (("above 0", "strength"),)
 
-    strength: float = 2.0
+    strength: Positive = 2.0
+    """Per cent of squared error worth one per cent of the file."""
     prices: dict[str, Tensor] | None = field(default=None, init=False)
     """What a bit costs each splat ``[N]`` in squared error, by attribute."""
 
+    def tell(self, module: SplatModule) -> None:
+        """Tell how strongly codes are chosen by their bits."""
+        module.rate_strength = self.strength
+
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
+        """Whether this iteration of the quantize phase begins with a measurement, and the codes of all splats."""
+        start, end = module.schedule.ends[Phase.PRUNE], module.schedule.ends[Phase.QUANTIZE]
+        every = -(-(end - start) // MEASUREMENTS)
+        return (iteration - 1 - start) % every == 0
+
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        """Measure, and choose the codes of all splats, when the phase starts and after splats were dropped.
+        """Choose the codes of the splats whose turn it is; of all, by a new measurement, when due or some were dropped.
 
         Raises:
             ValueError: The trainer has no data module with a scene.
         """
         if module.schedule.phase_at(iteration) is not Phase.QUANTIZE:
             return
-        if iteration == module.schedule.first_of(Phase.QUANTIZE) or not self._fits(module):
+        part = slice((iteration - 1) % TURNS, None, TURNS)
+        if self.is_due(module, iteration) or not self._fits(module):
             self._measure(trainer, module)
-            self._choose(module, slice(None))
-
-    def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
-        """Choose the codes of the splats whose turn it is; measure again, and choose those of all, when due."""
-        # Where non-finite splats were just dropped, the next iteration starts with a measurement.
-        if not self.prices or not self._fits(module) or module.schedule.phase_at(iteration + 1) is not Phase.QUANTIZE:
-            return
-        start, end = (module.schedule.ends[phase] for phase in (Phase.QUANTIZE - 1, Phase.QUANTIZE))
-        every = -(-(end - start) // MEASUREMENTS)
-        due = (iteration - start) % every == 0
-        if due:
-            self._measure(trainer, module)
-        self._choose(module, slice(None) if due else slice(iteration % TURNS, None, TURNS))
+            part = slice(None)
+        self._choose(module, part)
 
     def _fits(self, module: SplatModule) -> bool:
         """Whether the prices are those of the splats that there are now."""
@@ -389,26 +358,10 @@ class FiniteCodes(SplatCallback):
     As with non-finite splats (:class:`~nsvq_lightning.callbacks.DensityControl`), the run continues. A code cannot be
     dropped, as that would renumber the others: the quantizer gives it a new value
     (:meth:`nsvq_lightning.quantize.CodebookQuantizer.mend`), and its Adam moments are reset.
-
-    Args:
-        every: Iterations between two searches; a step whose loss is not finite always causes one.
-
-    Raises:
-        ValueError: ``every`` is below 1.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import FiniteCodes, standard
-        >>> callbacks = standard(codebook_finite=FiniteCodes(every=50))  # --callbacks.codebook_finite.every=50
-        >>> [type(callback).__name__ for callback in callbacks].count("FiniteCodes")
-        1
-        >>> FiniteCodes(every=0)
-        Traceback (most recent call last):
-        ValueError: every must be at least 1, got 0
     """
 
-    bounds = (("at least 1", "every"),)
-
-    every: int = 100
+    every: Count = 100
+    """Iterations between two searches; a step whose loss is not finite always causes one."""
 
     def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Search when due.
@@ -439,14 +392,6 @@ class FreezeCodes(SplatCallback):
 
     If another callback removes or adds splats in fine-tuning without their codes, the nearest codes are searched again,
     with a warning: the frozen ones belong to other rows.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import FreezeCodes, standard
-        >>> from nsvq_lightning.training.schedule import Phase, Schedule
-        >>> any(isinstance(callback, FreezeCodes) for callback in standard())
-        True
-        >>> Schedule(total=4500).first_of(Phase.FINETUNE)  # the iteration at which codes freeze
-        4201
     """
 
     passing = ("_edits", "_codes", "_warned")
@@ -455,16 +400,18 @@ class FreezeCodes(SplatCallback):
     _codes: dict[str, Tensor] | None = field(default=None, init=False)
     _warned: bool = field(default=False, init=False)
 
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
+        """Whether codes are frozen before this iteration."""
+        return iteration == module.schedule.first_of(Phase.FINETUNE)
+
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
-        """Freeze when fine-tuning starts, and again where splats have changed.
+        """Freeze when due, and again where splats have changed.
 
         Raises:
             RuntimeError: A codebook has never been placed.
         """
-        iteration, first = trainer.global_step + 1, module.schedule.first_of(Phase.FINETUNE)
-        if first is None or iteration < first:
-            return
-        if iteration == first and self._first_time("before", iteration):
+        iteration = trainer.global_step + 1
+        if self.is_due(module, iteration) and self._first_time("before", iteration):
             self._freeze(trainer, module, module.quantizers)
         elif stale := self._stale(module):
             if not self._warned:

@@ -27,6 +27,9 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 
 from .base import WritingCallback, picture_file
+from .settings import Whole
+
+log = logging.getLogger(__name__)
 
 
 def notify_monitors(trainer: Trainer, module: SplatModule) -> None:
@@ -40,9 +43,6 @@ def notify_monitors(trainer: Trainer, module: SplatModule) -> None:
         if isinstance(watcher, EarlyStopping | ModelCheckpoint) and (watcher.monitor or "").startswith("report/"):
             watcher.on_train_epoch_end(trainer, module)
             watcher.on_validation_end(trainer, module)
-
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(eq=False)
@@ -62,15 +62,6 @@ class MetricReport(WritingCallback):
     ``metrics.json``, ``views.csv``, a picture (photo, render, error) of each view in ``renders/``, and ``report.html``,
     which holds all of it and needs no other file. TensorBoard and Weights & Biases loggers show the pictures, too.
 
-    Args:
-        every: Iterations of this run between two evaluations; None is a twentieth of the run, 0 means only the ends of
-            phases.
-        lpips: Measure LPIPS in ``test`` if torchvision and its weights are installed.
-        pictures: Write a picture of each test view.
-
-    Raises:
-        ValueError: ``every`` is negative.
-
     Example:
         >>> from nsvq_lightning import SplatModule
         >>> from nsvq_lightning.callbacks import MetricReport
@@ -81,11 +72,14 @@ class MetricReport(WritingCallback):
     """
 
     stages = ("fit", "test")
-    bounds = (("at least 0", "every"),)
 
-    every: int | None = None
+    every: Whole | None = None
+    """Iterations of this run between two evaluations; None is a twentieth of the run, 0 means only the ends of phases.
+    """
     lpips: bool = True
+    """Measure LPIPS in ``test`` if torchvision and its weights are installed."""
     pictures: bool = True
+    """Write a picture of each test view."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -12,11 +12,12 @@ from nsvq_lightning.training.schedule import Phase, Schedule
 
 from .base import SplatCallback
 from .forecast import iterations_within
+from .settings import Count, Factor, Positive, Whole
 
 log = logging.getLogger(__name__)
 
 # Below so many, every minute more, or smaller photos, makes a scene visibly better.
-FEW_ITERATIONS = 1500
+MIN_ITERATIONS = 1500
 
 
 @dataclass(eq=False)
@@ -27,26 +28,8 @@ class PhaseSchedule(SplatCallback):
     (:mod:`nsvq_lightning.training.schedule` says how). The defaults are those of the recipe (docs/recipe.md), for a run
     of 15 000 iterations; ``configs/paper.yaml`` has the paper's.
 
-    Args:
-        total: Iterations of the run; None takes ``trainer.max_steps``.
-        reference_total: Iterations of the run that the ends are given for; None means ``total``: nothing scales.
-        warmup_end: Last iteration of the warm-up phase in the reference run.
-        prune_end: Last iteration of the prune phase in the reference run.
-        quantize_end: Last iteration of the quantize phase in the reference run.
-        position_decay: Iteration of the reference run from which the position's learning rate is constant.
-        min_density_interval: Lower limit of the interval of density control in this run.
-        min_reset_interval: Lower limit of the interval of opacity resets in this run.
-        min_replacement_interval: Lower limit of the window of code replacement and of the interval of refits.
-        min_finetune: Lower limit of the length of the fine-tune phase, up to half of what follows the prune phase.
-        iterations_per_photo: Most iterations for each train photo, as few are soon overfitted. None is
-            ``trainer.max_steps`` whatever the photos; ``total`` goes before it.
-        least_iterations: What ``iterations_per_photo`` leaves in any case.
-        minutes: Time to train on this machine, instead of a number of iterations: as many are chosen as measured steps
-            are likely to allow, and fine-tuning then ends when the time is over: not before half of it, and a quarter
-            of the run later at most. ``config.yaml`` of the run has both numbers.
-
     Raises:
-        ValueError: A number is out of range; or see :class:`~nsvq_lightning.training.schedule.Schedule`.
+        ValueError: See :class:`~nsvq_lightning.training.schedule.Schedule`.
 
     Example:
         >>> from nsvq_lightning.callbacks import PhaseSchedule
@@ -56,21 +39,35 @@ class PhaseSchedule(SplatCallback):
         (2000, 2120, 2520, 3000)
     """
 
-    bounds = (("at least 1", "iterations_per_photo", "least_iterations"), ("above 0", "minutes"))
-
     total: int | None = None
+    """Iterations of the run; None takes ``trainer.max_steps``."""
     reference_total: int | None = 15_000
+    """Iterations of the run that the ends are given for; None means ``total``: nothing scales."""
     warmup_end: int = 8000
+    """Last iteration of the warm-up phase in the reference run."""
     prune_end: int = 10_600
+    """Last iteration of the prune phase in the reference run."""
     quantize_end: int = 12_600
+    """Last iteration of the quantize phase in the reference run."""
     position_decay: int = 10_600
+    """Iteration of the reference run from which the position's learning rate is constant."""
     min_density_interval: int = 100
+    """Lower limit of the interval of density control in this run."""
     min_reset_interval: int = Schedule.min_reset_interval
+    """Lower limit of the interval of opacity resets in this run."""
     min_replacement_interval: int = Schedule.min_replacement_interval
+    """Lower limit of the window of code replacement and of the interval of refits."""
     min_finetune: int = Schedule.min_finetune
-    iterations_per_photo: int | None = None
-    least_iterations: int = 1
-    minutes: float | None = None
+    """Lower limit of the length of the fine-tune phase, up to half of what follows the prune phase."""
+    iterations_per_photo: Count | None = None
+    """Most iterations for each train photo, as few are soon overfitted. None is ``trainer.max_steps`` whatever the
+    photos; ``total`` goes before it."""
+    least_iterations: Count = 1
+    """What ``iterations_per_photo`` leaves in any case."""
+    minutes: Positive | None = None
+    """Time to train on this machine, instead of a number of iterations: as many are chosen as measured steps are likely
+    to allow, and fine-tuning then ends when the time is over: not before half of it, and a quarter of the run later at
+    most. ``config.yaml`` of the run has both numbers."""
     _steps: int = field(default=-1, init=False)
     _asked: int = field(default=-1, init=False)
     _max_steps: int | None = field(default=None, init=False)
@@ -113,12 +110,9 @@ class PhaseSchedule(SplatCallback):
             self._tuned_since = seconds
         elif iteration == first + timed and self._tuned_since is not None:
             pace = (seconds - self._tuned_since) / timed
-            planned = end - iteration
-            left = min(
-                max(round((60 * self.minutes - seconds) / pace), planned // 2), planned + module.schedule.part(4)
-            )
-            left = trainer.strategy.broadcast(left)
-            self._steps = iteration + left + module.schedule.saved
+            planned, left = end - iteration, round((60 * self.minutes - seconds) / pace)
+            left = min(max(left, planned // 2), planned + module.schedule.part(4))
+            self._steps = iteration + trainer.strategy.broadcast(left) + module.schedule.saved
             log.info("iterations: %d, as they take %.0f ms each now", self._steps, 1000 * pace)
 
     def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
@@ -132,7 +126,7 @@ class PhaseSchedule(SplatCallback):
             steps = iterations_within(self.minutes, trainer, module, self.schedule(self.reference_total or 1))
             self._set_max_steps(trainer, steps)
             log.info("iterations: %d, about %g min of training; evaluations and test come on top", steps, self.minutes)
-            if steps < FEW_ITERATIONS:
+            if steps < MIN_ITERATIONS:
                 log.warning("that is few: smaller photos (--data.factor=2) or fewer splats (--quality=0.5) give more")
         elif self.iterations_per_photo is not None and self.total is None:
             need = "a number of iterations for each photo needs the photos"
@@ -192,12 +186,6 @@ class PhaseSchedule(SplatCallback):
 class ShDegreeSchedule(SplatCallback):
     """Starts with SH degree 0 and adds one at intervals, up to the degree of the splats.
 
-    Args:
-        every: Iterations of the reference run between two degrees (1000 in the paper).
-
-    Raises:
-        ValueError: ``every`` is below 1.
-
     Example:
         >>> from nsvq_lightning.callbacks import ShDegreeSchedule
         >>> from nsvq_lightning.training.schedule import Schedule
@@ -206,9 +194,8 @@ class ShDegreeSchedule(SplatCallback):
         [0, 1, 2, 3, 3]
     """
 
-    bounds = (("at least 1", "every"),)
-
-    every: int = 500
+    every: Count = 500
+    """Iterations of the reference run between two degrees (1000 in the paper)."""
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Set the degree of the iteration that starts."""
@@ -222,25 +209,12 @@ class LearningRateDecay(SplatCallback):
     """Lets all learning rates but that of the positions, which have their own, fall in the last iterations of a run.
 
     They fall from their value to ``final`` times it, linearly in the logarithm.
-
-    Args:
-        final: Factor at the end of the run; 1 leaves the rates alone.
-        start: Iteration of the reference run at which they begin to fall; None for the start of fine-tuning.
-
-    Raises:
-        ValueError: ``final`` is not in (0, 1], or ``start`` is negative.
-
-    Example:
-        >>> from nsvq_lightning.callbacks import LearningRateDecay, standard
-        >>> callbacks = standard(rate_decay=LearningRateDecay(final=0.1))  # --callbacks.rate_decay.final=0.1
-        >>> [callback.final for callback in callbacks if isinstance(callback, LearningRateDecay)]
-        [0.1]
     """
 
-    bounds = (("in (0, 1]", "final"), ("at least 0", "start"))
-
-    final: float = 0.1
-    start: int | None = 10_600
+    final: Factor = 0.1
+    """Factor at the end of the run; 1 leaves the rates alone."""
+    start: Whole | None = 10_600
+    """Iteration of the reference run at which they begin to fall; None for the start of fine-tuning."""
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Scale the rates of this iteration."""

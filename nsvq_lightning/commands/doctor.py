@@ -339,7 +339,7 @@ CACHE_BYTES = 4 << 30
 def check_budget(scene: "Scene") -> Iterator[Finding]:
     """Memory against what is available; time from steps with as many splats as two recipes make of the scene."""
     from nsvq_lightning.callbacks import BudgetedGrowth, PhaseSchedule, SplatBudget
-    from nsvq_lightning.callbacks.forecast import PAPER_SPLATS, iteration_seconds, stretches
+    from nsvq_lightning.callbacks.forecast import PAPER_SPLATS, iteration_seconds
     from nsvq_lightning.callbacks.growth import splats_for_photos
     from nsvq_lightning.compute.devices import best_device
     from nsvq_lightning.data.scene import detailed_pixels
@@ -361,7 +361,7 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
     yield judged("run memory", text, free is not None and needed > free and advice)
     steps = phases.limited(fast["trainer"]["max_steps"], len(scene.train))
     all_steps, device = whole["trainer"]["max_steps"], best_device()
-    parts = stretches(phases.schedule(steps), growth, round(wanted.start * budget), budget)
+    parts = growth.stretches(phases.schedule(steps), round(wanted.start * budget), budget)
     recipes = tqdm([parts, [(1.0, paper)]], "timing steps of training", leave=False, disable=None)
     step, paper_step = (iteration_seconds(scene, each, device) for each in recipes)
     most = round(growth.overshoot * budget)

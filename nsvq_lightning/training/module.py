@@ -112,6 +112,10 @@ class SplatModule(resume.ResumedModule):
         """Strength ``[H, W]`` of the pixels of the next view, whose rendering then has ``absgrad``, or None."""
         self.splat_budget: int | None = None
         """How many splats the scene is to have in the end; None for as many as density control makes."""
+        self.rate_strength = 0.0
+        """How strongly codes are chosen by their bits, which a budget in bytes counts on; 0 for the nearest ones."""
+        self.stretches: Callable[[Schedule, int, int], list[tuple[float, int]]] | None = None
+        """How many splats a run has in which shares of it, from its schedule and how many it has at start and end."""
         self.evaluation_splats = None
         self.history: list[dict[str, Any]] = []
         self._step_factor = 1.0

@@ -89,7 +89,7 @@ def test_a_fit_starts_without_what_an_earlier_one_has_reached() -> None:
     callback = Acting()
     play(callback, 3)
     assert callback.count == 3
-    callback.setup(None, SplatModule(codebooks=None), "fit")  # type: ignore[arg-type]
+    callback.setup(SimpleNamespace(callbacks=[]), SplatModule(codebooks=None), "fit")  # type: ignore[arg-type]
     assert callback.state_dict() == Acting().state_dict()
 
 

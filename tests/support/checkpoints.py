@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.callbacks import RunCheckpoint
-from nsvq_lightning.training.schedule import Schedule
+from nsvq_lightning.training.module import SplatModule
 
 
 class CheckpointAt(RunCheckpoint):
@@ -19,7 +19,7 @@ class CheckpointAt(RunCheckpoint):
         super().__init__(keep=True)
         self.iterations = iterations
 
-    def is_due(self, schedule: Schedule, iteration: int) -> bool:
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
         return iteration in self.iterations
 
 

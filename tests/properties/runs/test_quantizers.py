@@ -25,7 +25,7 @@ from nsvq_lightning.quantize import (
 from nsvq_lightning.random import generator
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder
-from nsvq_lightning.training.schedule import Phase, Schedule
+from nsvq_lightning.training.schedule import Phase
 
 Quantizers = type[CodebookQuantizer]
 
@@ -53,7 +53,7 @@ class MiddleCheckpoint(RunCheckpoint):
     def __init__(self) -> None:
         super().__init__(keep=True)
 
-    def is_due(self, schedule: Schedule, iteration: int) -> bool:
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
         return iteration == MIDDLE
 
 

@@ -328,7 +328,7 @@ def test_minutes_choose_the_iterations(
     options = recipe_options(phases=phases, density=BudgetedGrowth(overshoot=2.0, full=ENDS["warmup_end"]))
     with caplog.at_level(logging.INFO):
         trainer, module = run(recipe(**options).values(), module=RECIPE_MODULE)
-    points = forecast.stretches(module.schedule, BudgetedGrowth(full=ENDS["warmup_end"]), 100, BUDGET)[0][1]
+    points = BudgetedGrowth(full=ENDS["warmup_end"]).stretches(module.schedule, 100, BUDGET)[0][1]
     assert 100 < points < 2 * BUDGET
     total = module.schedule.total
     assert 1 < total <= trainer.global_step == trainer.max_steps <= total + total // 4  # it is faster than that
