@@ -24,8 +24,9 @@ class SplatCallback(Callback):
     overrides ``setup``, or one of these hooks beside its method, calls it here first.
 
     A callback is a dataclass whose fields are its settings: the types of :mod:`nsvq_lightning.callbacks.settings` say
-    what they may be, the text below each is its help. Fields that :attr:`state` names are what it has reached, and have
-    ``init=False``. One that overrides ``__post_init__`` calls it here, for the check of the settings.
+    what they may be, the text below each is its help. What it has reached are attributes without an annotation, or
+    with ``init=False``; :attr:`state` names those that checkpoints carry. One that overrides ``__post_init__`` calls
+    it here, for the check of the settings.
 
     A callback that acts at certain iterations has a method ``is_due(module, iteration)``, and acts where that is true:
     a subclass changes when by overriding it.

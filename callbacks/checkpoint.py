@@ -4,7 +4,7 @@ import logging
 import signal
 import threading
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -123,10 +123,10 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     """Iterations between two checkpoints; None is a tenth of the schedule, 0 saves only at the end of the run."""
     keep: bool = False
     """Also keep each checkpoint as ``step-<iteration>.ckpt``."""
-    best_model_path: str = field(default="", init=False)
+    best_model_path = ""
     """Path of ``last_path`` under the name by which Lightning looks for ``ckpt_path="best"``."""
-    _saved: int = field(default=-1, init=False)
-    _training: bool = field(default=False, init=False)
+    _saved = -1
+    _training = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -186,8 +186,8 @@ class DensityControl(Densification):
         ValueError: ``max_splats`` is below ``min_splats``.
     """
 
-    tables: ClassVar[tuple[str, ...]] = ("gradient_sum", "view_count")
-    limit_name: ClassVar[str] = "max_splats"
+    tables = ("gradient_sum", "view_count")
+    limit_name = "max_splats"
 
     max_splats: int | None = None
     """Upper limit on the number of splats. If the scene starts with more, those that contribute most to the train views

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 from lightning.pytorch import Trainer
@@ -135,8 +135,8 @@ class BudgetedGrowth(Densification):
         ValueError: ``budget`` is below ``min_splats``, or ``full`` is not after ``start``.
     """
 
-    tables: ClassVar[tuple[str, ...]] = ("gradient_sum", "view_count", "edge_sum")
-    limit_name: ClassVar[str] = "the budget"
+    tables = ("gradient_sum", "view_count", "edge_sum")
+    limit_name = "the budget"
 
     budget: int | None = None
     """How many splats the scene is to have in the end; None for the module's
@@ -178,7 +178,7 @@ class BudgetedGrowth(Densification):
     """After so many times at which there is room, but hardly a splat over the threshold, the warm-up phase ends; 0 for
     never."""
     state = ("idle",)
-    idle: int = field(default=0, init=False)
+    idle = 0
     """How many times in a row hardly a splat had to be split."""
     _photos: ImageStore | None = field(default=None, init=False)
 

@@ -7,6 +7,7 @@ import torch
 from lightning.pytorch import Trainer
 
 from nsvq_lightning.compression.importance import below_cap, likely_effects, most_contributing
+from nsvq_lightning.data.scene import View
 from nsvq_lightning.training import distributed, row_ops, scene_module
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
@@ -40,10 +41,10 @@ class OpacityRegularization(SplatCallback):
         """Whether the loss of this iteration has the term."""
         return module.schedule.phase_at(iteration) is Phase.PRUNE
 
-    def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Turn the term on and off."""
         module.loss_terms.pop("opacity", None)
-        if self.is_due(module, iteration):
+        if self.is_due(module, trainer.global_step + 1):
             weight = module.schedule.strength(self.weight)
             module.loss_terms["opacity"] = lambda *_: weight * module.splats.opacities.sigmoid().sum()
 

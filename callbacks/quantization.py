@@ -398,7 +398,7 @@ class FreezeCodes(SplatCallback):
 
     _edits: int | None = field(default=None, init=False)
     _codes: dict[str, Tensor] | None = field(default=None, init=False)
-    _warned: bool = field(default=False, init=False)
+    _warned = False
 
     def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether codes are frozen before this iteration."""

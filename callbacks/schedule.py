@@ -68,8 +68,8 @@ class PhaseSchedule(SplatCallback):
     """Time to train on this machine, instead of a number of iterations: as many are chosen as measured steps are likely
     to allow, and fine-tuning then ends when the time is over: not before half of it, and a quarter of the run later at
     most. ``config.yaml`` of the run has both numbers."""
-    _steps: int = field(default=-1, init=False)
-    _asked: int = field(default=-1, init=False)
+    _steps = -1
+    _asked = -1
     _max_steps: int | None = field(default=None, init=False)
     """What this callback has set in the trainer, which a next fit does not take for what was asked."""
     passing = ("_tuned_since",)
@@ -197,9 +197,9 @@ class ShDegreeSchedule(SplatCallback):
     every: Count = 500
     """Iterations of the reference run between two degrees (1000 in the paper)."""
 
-    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
+    def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Set the degree of the iteration that starts."""
-        degree = module.schedule.sh_degree_at(trainer.global_step + 1, self.every, module.splats.sh_degree)
+        degree = module.schedule.sh_degree_at(iteration, self.every, module.splats.sh_degree)
         # A run that starts from a trained scene keeps its degree.
         module.active_sh_degree = max(degree, module.active_sh_degree)
 

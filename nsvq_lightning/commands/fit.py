@@ -152,9 +152,9 @@ class SplatCLI(LightningCLI):
         self._arguments, QuietParser.arguments = args, [*args, *given.settings_of(given.configs_among(args))]
         for argument in args:
             check_name(argument, "the command line", allow_outside=True)
-        if any(argument.partition("=")[0].endswith(".help") for argument in args):
-            # Texts of settings stand below them; to read them takes seconds, which only this help is worth.
-            set_parsing_settings(docstring_parse_attribute_docstrings=True)
+        # Texts of settings stand below them; to read them takes seconds, which only this help is worth.
+        asks = any(argument.partition("=")[0].endswith(".help") for argument in args)
+        set_parsing_settings(docstring_parse_attribute_docstrings=asks)
         for name, kind in STANDARD.items():
             if f"--callbacks.{name}.help" in args:
                 sys.stdout.write(class_help(f"callbacks.{name}", kind))

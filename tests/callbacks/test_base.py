@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,12 +13,14 @@ from lightning.pytorch import Callback, LightningModule
 from nsvq_lightning import callbacks
 from nsvq_lightning.callbacks import (
     BudgetedGrowth,
+    CanonicalCovariance,
     CodebookInit,
     CodebookRefit,
     CodebookReplacement,
     DensityControl,
     ExposureCompensation,
     FiniteCodes,
+    FreezeCodes,
     LearningRateDecay,
     MetricReport,
     OpacityRegularization,
@@ -30,6 +33,7 @@ from nsvq_lightning.callbacks import (
 )
 from nsvq_lightning.callbacks.base import SplatCallback
 from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.schedule import Schedule
 
 KINDS = [
     kind
@@ -91,6 +95,45 @@ def test_a_fit_starts_without_what_an_earlier_one_has_reached() -> None:
     assert callback.count == 3
     callback.setup(SimpleNamespace(callbacks=[]), SplatModule(codebooks=None), "fit")  # type: ignore[arg-type]
     assert callback.state_dict() == Acting().state_dict()
+
+
+def test_what_one_needs_of_another_is_on_the_module_whatever_their_order() -> None:
+    """A budget in bytes counts on codes that are chosen by their bits, and a length in minutes on how splats grow."""
+    found = []
+    for strength in (0.5, 2.0):
+        rates = RateDistortion(strength=strength)
+        for order in ([0, 1], [1, 0]):
+            module, both = SplatModule(), (SplatBudget(bytes=1_000_000), rates)
+            trainer: Any = SimpleNamespace(callbacks=[both[place] for place in order])
+            for callback in trainer.callbacks:
+                callback.setup(trainer, module, "fit")
+            found.append(module.splat_budget)
+    assert found[0] == found[1]
+    assert found[2] == found[3]
+    assert found[0] is not None
+    assert found[2] is not None
+    assert found[0] < found[2]
+
+
+LONG = range(1, 45_001)
+DUE: list[tuple[SplatCallback, Iterable[int]]] = [
+    (DensityControl(), [*range(600, 14_901, 100), *range(16_000, 20_001, 1000)]),
+    (BudgetedGrowth(start=300), range(400, 15_001, 100)),
+    (SplatSelection(), [15_001]),
+    (OpacityRegularization(), range(15_001, 20_001)),
+    (CanonicalCovariance(), [20_000]),
+    (CodebookInit(), [20_001]),
+    (FreezeCodes(), [43_001]),
+    (MetricReport(every=0), [15_000, 20_000, 43_000, 45_000]),
+    (RunCheckpoint(every=20_000), [15_000, 20_000, 40_000, 43_000, 45_000]),
+]
+
+
+@pytest.mark.parametrize(("callback", "iterations"), DUE)
+def test_callbacks_say_when_they_act(callback: Any, iterations: Iterable[int]) -> None:
+    """Oracle: the iterations of the paper's run, written down."""
+    module = SimpleNamespace(schedule=Schedule())
+    assert [iteration for iteration in LONG if callback.is_due(module, iteration)] == list(iterations)
 
 
 OUT_OF_RANGE = [

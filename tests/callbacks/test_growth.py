@@ -154,6 +154,25 @@ def test_the_first_prune_and_the_transparent_ones() -> None:
     assert stage.count == 4
 
 
+class Twice(BudgetedGrowth):
+    """Grows after two iterations alone."""
+
+    def is_due(self, module: Any, iteration: int) -> bool:
+        return iteration in (7, 33)
+
+
+def test_a_subclass_says_when_and_its_last_growth_prunes_none() -> None:
+    stage = stage_of([0.5, 0.5, 0.004], Twice(**RULES | {"first_prune": 0}, budget=1000))
+    counts = []
+    for iteration in (7, 10, 33):
+        rest = stage.count - 1
+        stage.module.splats.opacities.data[-1] = -5.5  # transparent
+        stage.step(iteration, view([1e-3] + [0.0] * rest, [1.0] * (rest + 1), [True] * (rest + 1)), BATCH)
+        counts.append(stage.count)
+    # One more and one less, nothing, one more.
+    assert counts == [3, 3, 4]
+
+
 def test_opacities_are_reset_and_the_faintest_go_when_the_others_have_recovered() -> None:
     opacities = [0.9, 0.04, 0.6, 0.03, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
     stage = stage_of(opacities, BudgetedGrowth(**RULES, budget=1000))

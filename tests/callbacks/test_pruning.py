@@ -79,6 +79,18 @@ def test_it_acts_when_the_phase_starts_by_the_modules_budget(until: int, left: i
     assert len(selected(random_splats(20), SplatSelection(), 7, until).means) == left
 
 
+class Late(SplatSelection):
+    """Selects five iterations into the phase."""
+
+    def is_due(self, module: Any, iteration: int) -> bool:
+        return iteration == 15
+
+
+@pytest.mark.parametrize(("until", "left"), [(14, 20), (15, 7)])
+def test_a_subclass_says_when(until: int, left: int) -> None:
+    assert len(selected(random_splats(20), Late(), 7, until).means) == left
+
+
 @pytest.mark.parametrize("budget", [None, 20, 30])
 def test_without_a_budget_or_below_it_nothing_happens(budget: int | None) -> None:
     raw = random_splats(20)
