@@ -243,7 +243,8 @@ def in_plain_words(message: str, classes: Iterable[str], arguments: Iterable[str
         return f"{name}: {' '.join(problem[0].split())}{meant}"
     types = re.search(r"Subtypes: .*", message) or re.search(r"Expected a .*", message)
     allowed: list[str] = []
-    for literal, kind in re.findall(r"Literal\[(.*?)\]|<class '(?:[\w.]*\.)?(\w+)'>", types[0] if types else ""):
+    kinds = r"Literal\[(.*?)\]|(?:<class '(?:[\w.]*\.)?|Annotated\[)(\w+)"
+    for literal, kind in re.findall(kinds, types[0] if types else ""):
         allowed += [each.strip("'") for each in literal.split(", ")] if literal else [WORDS.get(kind, kind)]
     *others, last = dict.fromkeys(allowed or ["the name of a class"])
     return f"{name}: expected {', '.join(others)}{' or ' * bool(others)}{last}, got {value[1]!r}{meant}"
