@@ -254,25 +254,23 @@ class DensityControl(Densification):
             return iteration in schedule.times(self.prune_start, self.prune_last, self.prune_every)
         return False
 
-    def is_reset_due(self, module: SplatModule, iteration: int) -> bool:
-        """Whether opacities are reset after this iteration of the warm-up phase."""
-        schedule = module.schedule
-        on_white = module.background == "white" and self.white_reset > 0
-        first = on_white and iteration == schedule.iteration(self.white_reset)
-        return first or iteration in schedule.reset_times(self.reset_last, self.reset_every)
-
     def act(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Clone, split, prune and reset when due."""
         schedule = module.schedule
         growing = schedule.phase_at(iteration) is Phase.WARMUP
-        if self.is_due(module, iteration):
-            added = self._grow(trainer, module, iteration) if growing else 0
-            huge = growing and iteration > schedule.iteration(self.huge_after)
-            pruned = self._prune(trainer, module, huge=huge)
+        if self.is_due(module, iteration) and growing:
+            added = self._grow(trainer, module, iteration)
+            pruned = self._prune(trainer, module, huge=iteration > schedule.iteration(self.huge_after))
             distributed.check_replicas(trainer, "density control")
-            level = logging.INFO if pruned and not growing else logging.DEBUG
-            log.log(level, "iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
-        if growing and self.is_reset_due(module, iteration):
+            log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
+        elif self.is_due(module, iteration):
+            pruned = self._prune(trainer, module, huge=False)
+            distributed.check_replicas(trainer, "pruning")
+            level = logging.INFO if pruned else logging.DEBUG
+            log.log(level, "iteration %d: pruned %d splats, %d remain", iteration, pruned, len(module.splats))
+        on_white = module.background == "white" and self.white_reset > 0
+        first = on_white and iteration == schedule.iteration(self.white_reset)
+        if growing and (first or iteration in schedule.reset_times(self.reset_last, self.reset_every)):
             self.reset_opacities(trainer, module, self.reset_opacity)
 
     @torch.no_grad()

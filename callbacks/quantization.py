@@ -396,7 +396,7 @@ class FreezeCodes(SplatCallback):
 
     passing = ("_edits", "_codes", "_warned")
 
-    _edits: int | None = field(default=None, init=False)
+    _edits = -1
     _codes: dict[str, Tensor] | None = field(default=None, init=False)
     _warned = False
 
@@ -427,7 +427,7 @@ class FreezeCodes(SplatCallback):
 
     def _stale(self, module: SplatModule) -> list[str]:
         """Attributes whose frozen codes belong to other rows; freezing anew would have replaced their tensor."""
-        edited, count = self._edits not in (None, module.splats.edits), len(module.splats)
+        edited, count = self._edits not in (-1, module.splats.edits), len(module.splats)
         frozen = {name: q.codes for name, q in module.quantizers.items() if len(q.codes) > 0}
         before = self._codes or {}
         return [name for name, codes in frozen.items() if len(codes) != count or (edited and codes is before[name])]

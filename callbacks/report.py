@@ -80,6 +80,7 @@ class MetricReport(WritingCallback):
     """Measure LPIPS in ``test`` if torchvision and its weights are installed."""
     pictures: bool = True
     """Write a picture of each test view."""
+    _compiled_before = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,7 +90,6 @@ class MetricReport(WritingCallback):
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
         self._seconds: dict[str, float] = {}
-        self._compiled_before = 0.0
 
     def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Forget the times of an earlier fit of this process."""
