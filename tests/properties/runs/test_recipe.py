@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from checkpoints import assert_same_end
 from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import BUDGET, ENDS, RECIPE_MODULE, Recipe, RunFactory, Whole, paper_replacement, recipe_options
 from torch import Tensor
 
-from checkpoints import assert_same_end
 from nsvq_lightning.callbacks import (
     BudgetedGrowth,
     CanonicalCovariance,
