@@ -259,27 +259,27 @@ def _choice(name: str, symbol: str, doc: str) -> Any:
     return _function(Lanes, 2)(emit)
 
 
-vmin = _choice("vmin", "<", "The smaller of two; the second one where the first is NaN.")
-vmax = _choice("vmax", ">", "The larger of two; the second one where the first is NaN.")
+minimum = _choice("minimum", "<", "The smaller of two; the second one where the first is NaN.")
+maximum = _choice("maximum", ">", "The larger of two; the second one where the first is NaN.")
 
 
 def _unary(name: str, doc: str) -> Any:
     def emit(context, builder, sig, values):
         return _llvm(builder, f"llvm.{name}.v16f32", _VF, values)
 
-    emit.__name__, emit.__doc__ = f"v{name}", doc
+    emit.__name__, emit.__doc__ = name, doc
     return _function(Lanes, 1)(emit)
 
 
-vsqrt = _unary("sqrt", "Square root; NaN below zero.")
-vfloor = _unary("floor", "Largest integer not above.")
-vceil = _unary("ceil", "Smallest integer not below.")
-vfabs = _unary("fabs", "Absolute value.")
+sqrt = _unary("sqrt", "Square root; NaN below zero.")
+floor = _unary("floor", "Largest integer not above.")
+ceil = _unary("ceil", "Smallest integer not below.")
+abs = _unary("fabs", "Absolute value.")
 
 
 @_function(Lanes, 3)
-def select(context, builder, sig, values):
-    """``select(mask, x, y)``: x where the mask is set, else y."""
+def where(context, builder, sig, values):
+    """``where(mask, x, y)``: x where the mask is set, else y."""
     return builder.select(*_spread(context, builder, sig.args, values))
 
 
@@ -300,7 +300,7 @@ def exp2(context, builder, sig, values):
 @inline
 def exp2_clamped(x):
     """2**x with x limited to [-125, 125]: never 0, never infinite; NaN becomes 2**-125."""
-    return exp2(vmin(vmax(x, -125), 125))
+    return exp2(minimum(maximum(x, -125), 125))
 
 
 @_function(Lanes, 1)

@@ -52,8 +52,8 @@ def take_row(image, target, white, images, y, height, length, pitch):
             # The last vector of a row overlaps the one before it instead of running past the end.
             x = min(x_, length - 16)
             p = simd.load(image, y * length + x)
-            # Not vmin and vmax: NaN must stay NaN.
-            simd.store(images, o + x, simd.select(p < 0, 0, simd.select(p > 1, 1, p)))
+            # Not minimum and maximum: NaN must stay NaN.
+            simd.store(images, o + x, simd.where(p < 0, 0, simd.where(p > 1, 1, p)))
         for x in range(length):
             simd.put(images, o + pitch + x, F(simd.get(target, y * length + x)) / white)
 
@@ -122,7 +122,7 @@ def similarity_of_row(moments, derivatives, length, pitch, lanes):
         simd.store(derivatives, o, by_mean)
         simd.store(derivatives, pitch + o, by_square)
         simd.store(derivatives, 2 * pitch + o, by_product)
-        total = total + simd.select(lane >= F(x_ - x), similarity, 0)
+        total = total + simd.where(lane >= F(x_ - x), similarity, 0)
     return simd.lane_sum(total)
 
 
@@ -155,11 +155,11 @@ def gradient_of_row(image, gradient, images, ring, y, length, pitch, l1_step, ss
         g = blur_across(ring, y, 0, PAD + x, pitch)
         g = simd.fma(2 * p, blur_across(ring, y, 1, PAD + x, pitch), g)
         g = simd.fma(q, blur_across(ring, y, 2, PAD + x, pitch), g)
-        sign = simd.select(p > q, l1_step, simd.select(p < q, -l1_step, 0))
+        sign = simd.where(p > q, l1_step, simd.where(p < q, -l1_step, 0))
         raw = simd.load(image, y * length + x)
         inside = (raw >= 0) & (raw <= 1)
-        simd.store(gradient, y * length + x, simd.select(inside, simd.fnma(ssim_step, g, sign), 0))
-        total = total + simd.select(lane >= F(x_ - x), simd.vfabs(p - q), 0)
+        simd.store(gradient, y * length + x, simd.where(inside, simd.fnma(ssim_step, g, sign), 0))
+        total = total + simd.where(lane >= F(x_ - x), simd.abs(p - q), 0)
     return simd.lane_sum(total)
 
 

@@ -174,7 +174,7 @@ def _box_distances(dim, boxes, at, x, row):
         value = simd.get(x, row + j)
         below = simd.load(boxes, at + 32 * j) - value
         above = value - simd.load(boxes, at + 32 * j + 16)
-        gap = simd.vmax(simd.vmax(below, above), 0)
+        gap = simd.maximum(simd.maximum(below, above), 0)
         total = simd.fma(gap, gap, total)
     return total
 
@@ -215,7 +215,7 @@ def _visit_leaf(dim, tree, leaf, x, i, limit, state):
 def place_of_least(least, block_of):
     """Where the least of blocks of 16 numbers is, the first of equal ones; lanes hold their least and its block."""
     smallest = simd.lane_min(least)
-    block = simd.lane_min(simd.select(least <= smallest, block_of, np.inf))
+    block = simd.lane_min(simd.where(least <= smallest, block_of, np.inf))
     lane = simd.mask_bits((least <= smallest) & (block_of <= block))
     return np.int64(block) * 16 + simd.lowest_bit(lane)
 
@@ -226,8 +226,8 @@ def _nearest_node(dim, nodes, x, row):
     nearest, group_of = simd.broadcast(np.inf), simd.broadcast(0)
     for group in range(nodes.size // (32 * dim)):
         distances = _box_distances(dim, nodes, group * 32 * dim, x, row)
-        group_of = simd.select(distances < nearest, group, group_of)
-        nearest = simd.vmin(distances, nearest)
+        group_of = simd.where(distances < nearest, group, group_of)
+        nearest = simd.minimum(distances, nearest)
     return place_of_least(nearest, group_of)
 
 
@@ -262,7 +262,7 @@ def _guess(dim, tree, x, count, state):
         distances = _code_distances(dim, codes, leaf, x, i * dim)
         limit = simd.lane_min(distances)
         if bounded:
-            limit = simd.lane_min(simd.select(distances > limit, distances, np.inf))
+            limit = simd.lane_min(simd.where(distances > limit, distances, np.inf))
         simd.put(best, i, np.inf)
         simd.put(label, i, _NO_CODE)
         simd.put(second, i, np.inf)

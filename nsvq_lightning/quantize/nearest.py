@@ -168,8 +168,8 @@ def _search_kernel(dim: int) -> Any:
                     total = simd.fma(difference, difference, total)
                 total = simd.fma(price, simd.load(table, at + 16 * dim), total)
                 cheaper = total < best
-                best = simd.select(cheaper, total, best)
-                block_of = simd.select(cheaper, block, block_of)
+                best = simd.where(cheaper, total, best)
+                block_of = simd.where(cheaper, block, block_of)
             simd.put(result, i, place_of_least(best, block_of))
 
     return parallel(search)

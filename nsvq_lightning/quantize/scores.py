@@ -142,12 +142,12 @@ def _score_block(dim, blocks, halves, block, rows, first, kept, state):
         value = simd.get(rows, row + 5 * dim + j)
         a5, b5 = simd.fnma(value, low, a5), simd.fnma(value, high, b5)
     below = (
-        (simd.vmin(a0, b0) < simd.get(limits, first))
-        | (simd.vmin(a1, b1) < simd.get(limits, first + 1))
-        | (simd.vmin(a2, b2) < simd.get(limits, first + 2))
-        | (simd.vmin(a3, b3) < simd.get(limits, first + 3))
-        | (simd.vmin(a4, b4) < simd.get(limits, first + 4))
-        | (simd.vmin(a5, b5) < simd.get(limits, first + 5))
+        (simd.minimum(a0, b0) < simd.get(limits, first))
+        | (simd.minimum(a1, b1) < simd.get(limits, first + 1))
+        | (simd.minimum(a2, b2) < simd.get(limits, first + 2))
+        | (simd.minimum(a3, b3) < simd.get(limits, first + 3))
+        | (simd.minimum(a4, b4) < simd.get(limits, first + 4))
+        | (simd.minimum(a5, b5) < simd.get(limits, first + 5))
     )
     if simd.mask_bits(below) != 0:
         sums = a0, b0, a1, b1, a2, b2, a3, b3, a4, b4, a5, b5

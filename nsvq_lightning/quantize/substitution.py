@@ -67,7 +67,7 @@ def fill_normal(seed, first, count, out, radius, angle):
     """
     for pair in range(count // 2):
         _uniforms(seed, (first // 2 + pair) * 16, radius, angle)
-        length = simd.vsqrt(simd.log2(simd.load(radius, 0)) * _MINUS_TWO_LN2)
+        length = simd.sqrt(simd.log2(simd.load(radius, 0)) * _MINUS_TWO_LN2)
         turn = simd.load(angle, 0)
         simd.store(out, pair * 32, length * _polynomial(_COS, turn * turn))
         simd.store(out, pair * 32 + 16, length * (turn * _polynomial(_SIN, turn * turn)))
@@ -92,7 +92,7 @@ def _outside(dim, x, rows, codebook, codes, begin, stop):
 @inline
 def _inverses(squared):
     """1/s, and 0 where s is 0 (or its inverse too large): a zero vector has no direction."""
-    return simd.select(squared > _TINY, 1 / squared, 0)
+    return simd.where(squared > _TINY, 1 / squared, 0)
 
 
 @inline
@@ -131,7 +131,7 @@ def _short_forward(dim: int) -> Any:
                 direction = simd.fma(aim, residual, spread * simd.load(noise, at + 16 * j))
                 simd.store(noise, at + 16 * j, direction)
                 error, squared = simd.fma(residual, residual, error), simd.fma(direction, direction, squared)
-            length = simd.vsqrt(error * _inverses(squared))
+            length = simd.sqrt(error * _inverses(squared))
             for j in range(dim):
                 simd.store(values, 16 * j, simd.fma(length, simd.load(noise, at + 16 * j), simd.load(values, 16 * j)))
             for lane in range(valid):

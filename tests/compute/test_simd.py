@@ -48,8 +48,8 @@ def test_a_scalar_stands_for_a_vector_of_it(values: Array) -> None:
         x = simd.load(a, 0)
         simd.store(out, 0, 2 * x - third)
         simd.store(out, 16, 1 / (x + 0.1))
-        simd.store(out, 32, simd.select(x > third, simd.fma(third, x, 1), 0))
-        simd.store(out, 48, simd.vmax(2, simd.vmin(x, 3)))
+        simd.store(out, 32, simd.where(x > third, simd.fma(third, x, 1), 0))
+        simd.store(out, 48, simd.maximum(2, simd.minimum(x, 3)))
         simd.store(out, 64, third)
         simd.store(out, 80, simd.load_one(a, 5))
         simd.store(out, 96, simd.load_vectors(a, 16)[2])
@@ -67,8 +67,8 @@ def test_a_scalar_stands_for_a_vector_of_it(values: Array) -> None:
 
 def test_minimum_and_maximum_take_the_second_argument_for_nan(values: Array) -> None:
     def kernel(a: Array, out: Array) -> None:
-        simd.store(out, 0, simd.vmin(simd.load(a, 0), simd.load(a, 16)))
-        simd.store(out, 16, simd.vmax(simd.load(a, 0), simd.load(a, 16)))
+        simd.store(out, 0, simd.minimum(simd.load(a, 0), simd.load(a, 16)))
+        simd.store(out, 16, simd.maximum(simd.load(a, 0), simd.load(a, 16)))
 
     values[3] = np.nan
     out = run(kernel, values, outputs=2)
@@ -97,7 +97,7 @@ def test_exponential_and_logarithm() -> None:
 def test_masks() -> None:
     def kernel(a: Array, out: Array) -> None:
         low = simd.load(a, 0) < simd.load(a, 16)
-        simd.store(out, 0, simd.select(low & ~(simd.load(a, 0) >= simd.load(a, 16)), simd.load(a, 0), simd.load(a, 16)))
+        simd.store(out, 0, simd.where(low & ~(simd.load(a, 0) >= simd.load(a, 16)), simd.load(a, 0), simd.load(a, 16)))
         out[16] = simd.mask_bits(low)
         out[17] = simd.lowest_bit(simd.mask_bits(low))
         out[18] = simd.mask_bits(simd.load(a, 0) > simd.load(a, 0))

@@ -58,12 +58,12 @@ def exponent(a, b, c, u0, v0, peak, x, y):
 @inline
 def highest_exponent(a, b, c, slope_x, slope_y, left, right, top, bottom):
     """Largest value of -(u² + v²) on rectangles relative to the splat's centre: it lies on the edges facing it."""
-    dx, dy = simd.vmax(left, simd.vmin(right, 0)), simd.vmax(top, simd.vmin(bottom, 0))
-    along_y = simd.vmax(top, simd.vmin(bottom, slope_x * dx))
-    along_x = simd.vmax(left, simd.vmin(right, slope_y * dy))
+    dx, dy = simd.maximum(left, simd.minimum(right, 0)), simd.maximum(top, simd.minimum(bottom, 0))
+    along_y = simd.maximum(top, simd.minimum(bottom, slope_x * dx))
+    along_x = simd.maximum(left, simd.minimum(right, slope_y * dy))
     first, _, _ = exponent(a, b, c, 0, 0, 0, dx, along_y)
     second, _, _ = exponent(a, b, c, 0, 0, 0, along_x, dy)
-    return simd.vmax(first, second)
+    return simd.maximum(first, second)
 
 
 # How far below the threshold, in log2 α, a block still counts as reached: what rounding can add to the exponent of a
@@ -88,7 +88,7 @@ def alpha_at(batch, r, x, y):
     a, b, c = rec.load3(batch, r + rec.A, 1)
     u0, v0 = simd.load_one(batch, r + rec.X), simd.load_one(batch, r + rec.Y)
     power, _, _ = exponent(a, b, c, u0, v0, simd.load_one(batch, r + rec.LOG2_OPACITY), x, y)
-    return simd.select(power >= rec.LOG2_ALPHA_MIN, simd.vmin(simd.exp2(power), ALPHA_MAX), 0)
+    return simd.where(power >= rec.LOG2_ALPHA_MIN, simd.minimum(simd.exp2(power), ALPHA_MAX), 0)
 
 
 @inline
@@ -124,8 +124,8 @@ def next_splat(low, high, base):
 def blend_one(batch, r, alpha, t, after, left, sums):
     """Add one splat where it leaves the pixel open; returns the transmittance left and the sums."""
     open_ = after >= TRANSMITTANCE_MIN
-    weight = simd.select(open_, alpha * t, 0)
-    return simd.select(open_, after, left), accumulate(batch, r, weight, sums)
+    weight = simd.where(open_, alpha * t, 0)
+    return simd.where(open_, after, left), accumulate(batch, r, weight, sums)
 
 
 # Lower bound on the transmittance of closed pixels: far below the threshold, far above denormal numbers.
@@ -166,7 +166,7 @@ def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
             bit = 0
             low, high = np.int64(0), np.int64(0)
         # The transmittance of closed pixels keeps falling; keep it clear of denormals.
-        t = simd.vmax(t4, TINY)
+        t = simd.maximum(t4, TINY)
     simd.store(state, T + o, t)
     simd.store(state, T_LEFT + o, left)
     simd.store(state, R_SUM + o, sums[0])
@@ -220,8 +220,8 @@ def blend_tile(records, entries, begin, end, corner, size, background, grid, tou
     alive = 0
     for block in range(BLOCKS):
         inside = (simd.load(grid, 16 * block) < columns) & (simd.load(grid, 256 + 16 * block) < rows)
-        simd.store(state, T + 16 * block, simd.select(inside, 1, 0))
-        simd.store(state, T_LEFT + 16 * block, simd.select(inside, 1, 0))
+        simd.store(state, T + 16 * block, simd.where(inside, 1, 0))
+        simd.store(state, T_LEFT + 16 * block, simd.where(inside, 1, 0))
         for plane in range(2, 6):
             simd.store(state, 256 * plane + 16 * block, 0)
         if simd.mask_bits(inside) != 0:
@@ -384,7 +384,7 @@ def splat_backward(records, row, blocks, corner, wanted, state):
         blocks &= blocks - 1
         power, u, v = exponent(a, b, c, u0, v0, peak, simd.load(state, s + BACK_X), simd.load(state, s + BACK_Y))
         raw = simd.exp2(power)
-        alpha = simd.select(power >= rec.LOG2_ALPHA_MIN, simd.vmin(raw, ALPHA_MAX), 0)
+        alpha = simd.where(power >= rec.LOG2_ALPHA_MIN, simd.minimum(raw, ALPHA_MAX), 0)
         g_r, g_g = simd.load(state, s + BACK_RED), simd.load(state, s + BACK_GREEN)
         g_b = simd.load(state, s + BACK_BLUE)
         d = rec.dot3((g_r, g_g, g_b), color)
@@ -394,10 +394,10 @@ def splat_backward(records, row, blocks, corner, wanted, state):
         after = simd.fnma(alpha, t, t)
         open_ = after >= TRANSMITTANCE_MIN
         td = t * d
-        weight = simd.select(open_, alpha * t, 0)
+        weight = simd.where(open_, alpha * t, 0)
         simd.store(state, s + BACK_REST, simd.fnma(weight, d, rest))
-        simd.store(state, s + BACK_T, simd.vmax(after, TINY))
-        h = simd.select(open_ & (raw <= ALPHA_MAX), alpha / (1 - alpha) * (td - rest), 0)
+        simd.store(state, s + BACK_T, simd.maximum(after, TINY))
+        h = simd.where(open_ & (raw <= ALPHA_MAX), alpha / (1 - alpha) * (td - rest), 0)
         s_r, s_g, s_b = simd.fma(weight, g_r, s_r), simd.fma(weight, g_g, s_g), simd.fma(weight, g_b, s_b)
         hu, hv = h * u, h * v
         s_h, s_u, s_v = s_h + h, s_u + hu, s_v + hv
@@ -406,7 +406,7 @@ def splat_backward(records, row, blocks, corner, wanted, state):
             s_z = simd.fma(weight, simd.load(state, s + BACK_DEPTH), s_z)
         if with_absgrad:
             along_y = simd.fma(b, hu, c * hv)
-            s_ax, s_ay = s_ax + simd.vmax(hu, 0 - hu), s_ay + simd.vmax(along_y, 0 - along_y)
+            s_ax, s_ay = s_ax + simd.maximum(hu, 0 - hu), s_ay + simd.maximum(along_y, 0 - along_y)
             s_map = simd.fma(weight, simd.load(state, s + BACK_WEIGHT), s_map)
     return simd.lane_sums((s_r, s_g, s_b, s_h, s_u, s_v, s_uu, s_uv, s_vv, s_z, s_ax, s_ay, s_map))
 

@@ -20,7 +20,7 @@ def unit_direction(camera, means):
     """Unit vector from the camera to the splat and the inverse distance."""
     position = rec.load3(camera, rec.POSITION, 1)
     d = means[0] - position[0], means[1] - position[1], means[2] - position[2]
-    inverse = 1 / simd.vsqrt(simd.vmax(rec.dot3(d, d), 1e-20))
+    inverse = 1 / simd.sqrt(simd.maximum(rec.dot3(d, d), 1e-20))
     return rec.scale3(inverse, d), inverse
 
 
@@ -134,9 +134,9 @@ def color_range(camera, means, colors, bands, ids, first, last, records, scratch
             gather_sh(shN, ids, start, stride, coefficients, scratch)
         r, g, b = color(degree, direction, simd.gather_rows3(sh0, ids, start), scratch)
         # This order of arguments keeps NaN, so that the loss shows it.
-        simd.store(scratch, 0, simd.vmax(0, r))
-        simd.store(scratch, 16, simd.vmax(0, g))
-        simd.store(scratch, 32, simd.vmax(0, b))
+        simd.store(scratch, 0, simd.maximum(0, r))
+        simd.store(scratch, 16, simd.maximum(0, g))
+        simd.store(scratch, 32, simd.maximum(0, b))
         for lane in range(min(16, last - start)):
             o = rec.RECORD * np.int64(simd.get(ids, start + lane)) + rec.RED
             simd.put(records, o, simd.get(scratch, lane))

@@ -33,11 +33,11 @@ def view_depth(camera, mean):
 def axes_of(quat, log_scales):
     """Unit quaternion and its inverse norm, axis lengths, and the rows of the matrix M = R·diag(lengths)."""
     w, x, y, z = quat
-    largest = simd.vmax(simd.vmax(simd.vfabs(w), simd.vfabs(x)), simd.vmax(simd.vfabs(y), simd.vfabs(z)))
-    shrink = simd.select(largest > HUGE_QUATERNION, SHRINK, 1)
+    largest = simd.maximum(simd.maximum(simd.abs(w), simd.abs(x)), simd.maximum(simd.abs(y), simd.abs(z)))
+    shrink = simd.where(largest > HUGE_QUATERNION, SHRINK, 1)
     w, x, y, z = w * shrink, x * shrink, y * shrink, z * shrink
     squared = simd.fma(w, w, simd.fma(x, x, simd.fma(y, y, z * z)))
-    inverse = 1 / simd.vsqrt(simd.vmax(squared, MIN_SQUARED_NORM))
+    inverse = 1 / simd.sqrt(simd.maximum(squared, MIN_SQUARED_NORM))
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
     s0 = simd.exp2_clamped(log_scales[0] * rec.LOG2_E)
     s1 = simd.exp2_clamped(log_scales[1] * rec.LOG2_E)
@@ -63,8 +63,12 @@ def affine(camera, mean):
     y = rec.rotate(camera, 1, mean) + simd.load_one(camera, rec.TRANSLATION + 1)
     z = view_depth(camera, mean)
     inverse = 1 / z
-    slope_x = simd.vmin(simd.load_one(camera, rec.HIGH_X), simd.vmax(simd.load_one(camera, rec.LOW_X), x * inverse))
-    slope_y = simd.vmin(simd.load_one(camera, rec.HIGH_Y), simd.vmax(simd.load_one(camera, rec.LOW_Y), y * inverse))
+    slope_x = simd.minimum(
+        simd.load_one(camera, rec.HIGH_X), simd.maximum(simd.load_one(camera, rec.LOW_X), x * inverse)
+    )
+    slope_y = simd.minimum(
+        simd.load_one(camera, rec.HIGH_Y), simd.maximum(simd.load_one(camera, rec.LOW_Y), y * inverse)
+    )
     t0 = affine_row(camera, 0, simd.load_one(camera, rec.FX) * inverse, slope_x)
     t1 = affine_row(camera, 1, simd.load_one(camera, rec.FY) * inverse, slope_y)
     return (x, y, z), inverse, (slope_x, slope_y), t0, t1
@@ -86,7 +90,7 @@ def footprint(camera, means, quats, scales, logits):
     xx, yy, xy = rec.dot3(u, u), rec.dot3(v, v), rec.dot3(u, v)
     # |u|²|v|² - (u·v)² = |u × v|² (Lagrange): no cancellation for large splats.
     size = xx + yy
-    unit = simd.select(size > HUGE_FOOTPRINT, 1 / size, 1)
+    unit = simd.where(size > HUGE_FOOTPRINT, 1 / size, 1)
     n = rec.scale3(unit, rec.cross(u, v))
     determinant = rec.dot3(n, n) + simd.fma(BLUR, size, BLUR_SQUARED) * unit * unit
     xx, yy = xx + BLUR, yy + BLUR
@@ -96,24 +100,24 @@ def footprint(camera, means, quats, scales, logits):
     log2_opacity = -simd.log2(1 + simd.exp2_clamped(-(logits * rec.LOG2_E)))
     # α reaches 1/255 where u² + v² ≤ log2(255 o): a box of half sizes √(2 ln(255 o)·Σ_ii).
     reach = (log2_opacity - rec.LOG2_ALPHA_MIN) * (F(2) * LN2)
-    half_x, half_y = simd.vsqrt(simd.vmax(reach, 0) * xx), simd.vsqrt(simd.vmax(reach, 0) * yy)
-    left, right = simd.vmax(simd.vceil(px - half_x - 0.5), 0), simd.vfloor(px + half_x - 0.5)
-    top, bottom = simd.vmax(simd.vceil(py - half_y - 0.5), 0), simd.vfloor(py + half_y - 0.5)
-    right = simd.vmin(right, simd.load_one(camera, rec.WIDTH) - 1)
-    bottom = simd.vmin(bottom, simd.load_one(camera, rec.HEIGHT) - 1)
+    half_x, half_y = simd.sqrt(simd.maximum(reach, 0) * xx), simd.sqrt(simd.maximum(reach, 0) * yy)
+    left, right = simd.maximum(simd.ceil(px - half_x - 0.5), 0), simd.floor(px + half_x - 0.5)
+    top, bottom = simd.maximum(simd.ceil(py - half_y - 0.5), 0), simd.floor(py + half_y - 0.5)
+    right = simd.minimum(right, simd.load_one(camera, rec.WIDTH) - 1)
+    bottom = simd.minimum(bottom, simd.load_one(camera, rec.HEIGHT) - 1)
 
     seen = (z > simd.load_one(camera, rec.NEAR)) & (reach > 0) & (left <= right) & (top <= bottom)
     seen = seen & (size < LARGEST_FOOTPRINT) & (determinant < FINITE)
-    seen = seen & (simd.vfabs(px) < FINITE) & (simd.vfabs(py) < FINITE) & (logits >= -FINITE)
+    seen = seen & (simd.abs(px) < FINITE) & (simd.abs(py) < FINITE) & (logits >= -FINITE)
     # exp2_clamped makes a broken scale finite; the raw one still shows that it is broken.
     seen = seen & (scales[0] + scales[1] + scales[2] < FINITE)
 
     slope_y = xy / yy
-    a = rec.FACTOR_SCALE * simd.vsqrt(yy * unit / determinant * unit)
-    record = (px, py, a, -(a * slope_y), rec.FACTOR_SCALE / simd.vsqrt(yy), log2_opacity, z, xy / xx, slope_y)
+    a = rec.FACTOR_SCALE * simd.sqrt(yy * unit / determinant * unit)
+    record = (px, py, a, -(a * slope_y), rec.FACTOR_SCALE / simd.sqrt(yy), log2_opacity, z, xy / xx, slope_y)
     tile = F(1.0 / rec.TILE)
-    tiles = (simd.vfloor(left * tile), simd.vfloor(top * tile), simd.vfloor(right * tile), simd.vfloor(bottom * tile))
-    return seen, record, tiles, simd.vceil(simd.vmax(half_x, half_y))
+    tiles = (simd.floor(left * tile), simd.floor(top * tile), simd.floor(right * tile), simd.floor(bottom * tile))
+    return seen, record, tiles, simd.ceil(simd.maximum(half_x, half_y))
 
 
 @inline
@@ -245,8 +249,8 @@ def light(u, v):
     n = rec.cross(u, v)
     area, size = rec.dot3(n, n), rec.dot3(u, u) + rec.dot3(v, v)
     added = BLUR * size + BLUR_SQUARED
-    squared = simd.select(size < HUGE_FOOTPRINT, area / (area + added), 1)
-    return simd.vmax(squared, LEAST_LIGHT), area, size, added, n
+    squared = simd.where(size < HUGE_FOOTPRINT, area / (area + added), 1)
+    return simd.maximum(squared, LEAST_LIGHT), area, size, added, n
 
 
 @parallel
@@ -257,4 +261,4 @@ def keep_light(thread, threads, camera, means, quats, scales, ids, count, factor
         _, _, _, t0, t1 = affine(camera, simd.gather_rows3(means, ids, start))
         _, _, _, m = axes_of(simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start))
         squared, _, _, _, _ = light(image_axes(t0, m), image_axes(t1, m))
-        simd.store(factors, start, simd.vsqrt(squared))
+        simd.store(factors, start, simd.sqrt(squared))

@@ -59,8 +59,8 @@ def axes_backward(camera, view, axes, gu, gv, g2x, g2y, g_depth):
     fx, fy = simd.load_one(camera, rec.FX) * inverse, simd.load_one(camera, rec.FY) * inverse
     fx_z, fy_z = fx * inverse, fy * inverse
     tx, ty = x * inverse, y * inverse
-    free_x = simd.select((slope_x >= tx) & (slope_x <= tx), 1, 0)
-    free_y = simd.select((slope_y >= ty) & (slope_y <= ty), 1, 0)
+    free_x = simd.where((slope_x >= tx) & (slope_x <= tx), 1, 0)
+    free_y = simd.where((slope_y >= ty) & (slope_y <= ty), 1, 0)
     vx = simd.fnma(free_x * fx_z, j02, fx * g2x)
     vy = simd.fnma(free_y * fy_z, j12, fy * g2y)
     vz = (1 + free_x) * fx_z * slope_x * j02 + (1 + free_y) * fy_z * slope_y * j12
@@ -142,9 +142,9 @@ def project_backward(
         quat, scale = simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start)
         g_mean, g_quat, g_scale = geometry_backward(camera, mean, quat, scale, record, total, g2x, g2y)
         # A colour below 0 was clamped.
-        red = simd.select(record[rec.RED] > 0, total[rec.SUM_RED], 0)
-        green = simd.select(record[rec.GREEN] > 0, total[rec.SUM_GREEN], 0)
-        blue = simd.select(record[rec.BLUE] > 0, total[rec.SUM_BLUE], 0)
+        red = simd.where(record[rec.RED] > 0, total[rec.SUM_RED], 0)
+        green = simd.where(record[rec.GREEN] > 0, total[rec.SUM_GREEN], 0)
+        blue = simd.where(record[rec.BLUE] > 0, total[rec.SUM_BLUE], 0)
         rgb = red, green, blue
         gx, gy, gz = color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, work)
         simd.scatter_rows3(g_means, ids, start, (g_mean[0] + gx, g_mean[1] + gy, g_mean[2] + gz))
@@ -175,11 +175,11 @@ def keep_light_backward(
         # At the floor, and where the blur does not count, the factor is constant.
         free = (size < projection.HUGE_FOOTPRINT) & (squared > projection.LEAST_LIGHT)
         # A huge splat's v × n would overflow, and 0 · ∞ is not 0.
-        u = simd.select(free, u[0], 0), simd.select(free, u[1], 0), simd.select(free, u[2], 0)
-        v = simd.select(free, v[0], 0), simd.select(free, v[1], 0), simd.select(free, v[2], 0)
+        u = simd.where(free, u[0], 0), simd.where(free, u[1], 0), simd.where(free, u[2], 0)
+        v = simd.where(free, v[0], 0), simd.where(free, v[1], 0), simd.where(free, v[2], 0)
         whole = area + added
-        g = simd.select(free, simd.load(gradient, start) * simd.vsqrt(squared) / whole, 0)
-        by_area = simd.select(free, g * added / area, 0)
+        g = simd.where(free, simd.load(gradient, start) * simd.sqrt(squared) / whole, 0)
+        by_area = simd.where(free, g * added / area, 0)
         by_size = g * projection.BLUR
         vn, nu = rec.cross(v, n), rec.cross(n, u)
         gu = by_area * vn[0] - by_size * u[0], by_area * vn[1] - by_size * u[1], by_area * vn[2] - by_size * u[2]
