@@ -4,7 +4,8 @@ Whether Numba vectorizes a plain loop is up to LLVM; the kernels of this package
 ``Lanes`` and ``Mask`` are Numba types that hold one LLVM ``<16 x float>`` and ``<16 x i1>``. LLVM turns them into one
 AVX-512, two AVX2 or four NEON/SSE registers, so one source serves every CPU. In operators, and in functions of vectors,
 a scalar stands for a vector that holds it in every lane. All functions here are intrinsics: they only exist inside
-``@njit`` code.
+``@njit`` code. Those that ``triton.language`` has, too, bear the same names, and what is written with them alone
+compiles for a GPU as well (:mod:`nsvq_lightning.compute.formulas`).
 
 Conventions: a memory argument is a pair (one-dimensional contiguous array, element offset); nothing is
 bounds-checked. Floating-point code may be contracted (a·b + c with one rounding) but never reassociated, so NaN and
@@ -21,8 +22,6 @@ from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
-
-from nsvq_lightning.compute.jit import inline
 
 WIDTH = 16
 
@@ -295,12 +294,6 @@ def exp2(context, builder, sig, values):
     power = _polynomial(builder, fraction, powers)
     exponent = builder.shl(builder.bitcast(shifted, _VI), _integers(23))
     return builder.bitcast(builder.add(builder.bitcast(power, _VI), exponent), _VF)
-
-
-@inline
-def exp2_clamped(x):
-    """2**x with x limited to [-125, 125]: never 0, never infinite; NaN becomes 2**-125."""
-    return exp2(minimum(maximum(x, -125), 125))
 
 
 @_function(Lanes, 1)

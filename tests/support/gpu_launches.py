@@ -44,7 +44,7 @@ def tensor(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
 
 
 def lens() -> Lens:
-    return Lens(tensor(16), 90.0, 90.0, 50.5, 30.0, WIDTH, HEIGHT)
+    return Lens(tensor(20), 90.0, 90.0, 50.5, 30.0, WIDTH, HEIGHT)
 
 
 def attributes() -> tuple[torch.Tensor, ...]:

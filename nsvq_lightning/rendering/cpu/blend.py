@@ -13,11 +13,18 @@ import numpy as np
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel
-from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.cpu import records as rec
+from nsvq_lightning.rendering.formulas import (
+    ALPHA_MAX,
+    LOG2_ALPHA_MIN,
+    TILE,
+    TRANSMITTANCE_MIN,
+    TWO_LN2,
+    blend_step,
+    dot3,
+    exponent,
+)
 
-ALPHA_MAX = F(constants.ALPHA_MAX)
-TRANSMITTANCE_MIN = F(constants.TRANSMITTANCE_MIN)
 BATCH = 128
 BLOCKS = 16
 BLOCK_SIDE = 4
@@ -48,14 +55,6 @@ def offsets_at(a, b, c, x, y):
 
 
 @inline
-def exponent(a, b, c, u0, v0, peak, x, y):
-    """log2 α and the two factors of the exponent."""
-    u = simd.fma(a, x, simd.fma(b, y, u0))
-    v = simd.fma(c, y, v0)
-    return simd.fnma(u, u, simd.fnma(v, v, peak)), u, v
-
-
-@inline
 def highest_exponent(a, b, c, slope_x, slope_y, left, right, top, bottom):
     """Largest value of -(u² + v²) on rectangles relative to the splat's centre: it lies on the edges facing it."""
     dx, dy = simd.maximum(left, simd.minimum(right, 0)), simd.maximum(top, simd.minimum(bottom, 0))
@@ -79,7 +78,7 @@ def reachable_blocks(batch, o, x, y, grid):
     a, b, c = rec.load3(batch, o + rec.A, 1)
     slope_x, slope_y = simd.load_one(batch, o + rec.SLOPE_X), simd.load_one(batch, o + rec.SLOPE_Y)
     peak = highest_exponent(a, b, c, slope_x, slope_y, left, left + side, top, top + side)
-    return simd.mask_bits(peak >= rec.LOG2_ALPHA_MIN - REACH_MARGIN - simd.get(batch, o + rec.LOG2_OPACITY))
+    return simd.mask_bits(peak >= LOG2_ALPHA_MIN - REACH_MARGIN - simd.get(batch, o + rec.LOG2_OPACITY))
 
 
 @inline
@@ -88,7 +87,7 @@ def alpha_at(batch, r, x, y):
     a, b, c = rec.load3(batch, r + rec.A, 1)
     u0, v0 = simd.load_one(batch, r + rec.X), simd.load_one(batch, r + rec.Y)
     power, _, _ = exponent(a, b, c, u0, v0, simd.load_one(batch, r + rec.LOG2_OPACITY), x, y)
-    return simd.where(power >= rec.LOG2_ALPHA_MIN, simd.minimum(simd.exp2(power), ALPHA_MAX), 0)
+    return simd.where(power >= LOG2_ALPHA_MIN, simd.minimum(simd.exp2(power), ALPHA_MAX), 0)
 
 
 @inline
@@ -270,7 +269,7 @@ def tile_corner(tile, group_columns):
     side = 1 << rec.GROUP_SHIFT
     x = (group % group_columns) * side + inside % side
     y = (group // group_columns) * side + inside // side
-    return x * rec.TILE, y * rec.TILE
+    return x * TILE, y * TILE
 
 
 @parallel
@@ -383,21 +382,16 @@ def splat_backward(records, row, blocks, corner, wanted, state):
         s = BLOCK_STATE * simd.lowest_bit(blocks)
         blocks &= blocks - 1
         power, u, v = exponent(a, b, c, u0, v0, peak, simd.load(state, s + BACK_X), simd.load(state, s + BACK_Y))
-        raw = simd.exp2(power)
-        alpha = simd.where(power >= rec.LOG2_ALPHA_MIN, simd.minimum(raw, ALPHA_MAX), 0)
         g_r, g_g = simd.load(state, s + BACK_RED), simd.load(state, s + BACK_GREEN)
         g_b = simd.load(state, s + BACK_BLUE)
-        d = rec.dot3((g_r, g_g, g_b), color)
+        d = dot3((g_r, g_g, g_b), color)
         if with_depth:
             d = simd.fma(simd.load(state, s + BACK_DEPTH), z, d)
         t, rest = simd.load(state, s + BACK_T), simd.load(state, s + BACK_REST)
-        after = simd.fnma(alpha, t, t)
-        open_ = after >= TRANSMITTANCE_MIN
-        td = t * d
-        weight = simd.where(open_, alpha * t, 0)
+        raw, alpha, after, open_, weight = blend_step(power, t)
         simd.store(state, s + BACK_REST, simd.fnma(weight, d, rest))
         simd.store(state, s + BACK_T, simd.maximum(after, TINY))
-        h = simd.where(open_ & (raw <= ALPHA_MAX), alpha / (1 - alpha) * (td - rest), 0)
+        h = simd.where(open_ & (raw <= ALPHA_MAX), alpha / (1 - alpha) * (t * d - rest), 0)
         s_r, s_g, s_b = simd.fma(weight, g_r, s_r), simd.fma(weight, g_g, s_g), simd.fma(weight, g_b, s_b)
         hu, hv = h * u, h * v
         s_h, s_u, s_v = s_h + h, s_u + hu, s_v + hv
@@ -459,9 +453,6 @@ def blend_backward(
                 start_block(block, corner, size, planes, gradients, pixel_weights, wanted, grid, state)
             place = group % group_columns, group // group_columns
             tile_backward(records, integers, entries, begin, end, corner, place, wanted, touched, sums, state)
-
-
-TWO_LN2 = F(2 * np.log(2.0))
 
 
 @parallel

@@ -3,25 +3,14 @@
 import numpy as np
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline
+from nsvq_lightning.compute.jit import inline
 from nsvq_lightning.compute.rows import clear
-from nsvq_lightning.rendering import sh
+from nsvq_lightning.rendering import formulas
 from nsvq_lightning.rendering.cpu import records as rec
+from nsvq_lightning.rendering.formulas import C0, bands1, bands2, bands3, clamped, mean_gradient, scale3, unit_direction
 
-C0, C1 = F(sh.C0), F(sh.C1)
-C2A, C2B, C2C = (F(value) for value in sh.C2)
-C3A, C3B, C3C, C3D, C3E = (F(value) for value in sh.C3)
 # How many splats ahead the rows of a list are prefetched.
 AHEAD = 32
-
-
-@inline
-def unit_direction(camera, means):
-    """Unit vector from the camera to the splat and the inverse distance."""
-    position = rec.load3(camera, rec.POSITION, 1)
-    d = means[0] - position[0], means[1] - position[1], means[2] - position[2]
-    inverse = 1 / simd.sqrt(simd.maximum(rec.dot3(d, d), 1e-20))
-    return rec.scale3(inverse, d), inverse
 
 
 @inline
@@ -72,37 +61,6 @@ def add_band(columns, k, basis, rgb):
 
 
 @inline
-def bands1(d):
-    """Basis of degree 1 at unit direction d."""
-    return -(C1 * d[1]), C1 * d[2], -(C1 * d[0])
-
-
-@inline
-def bands2(d):
-    """Basis of degree 2."""
-    x, y, z = d
-    xx, yy, zz = x * x, y * y, z * z
-    return C2A * (x * y), -(C2A * (y * z)), C2B * (zz + zz - xx - yy), -(C2A * (x * z)), C2C * (xx - yy)
-
-
-@inline
-def bands3(d):
-    """Basis of degree 3."""
-    x, y, z = d
-    xx, yy, zz = x * x, y * y, z * z
-    around = 4 * zz - xx - yy
-    return (
-        -(C3A * y * (3 * xx - yy)),
-        C3B * (x * y) * z,
-        -(C3C * y * around),
-        C3D * z * (zz + zz - 3 * (xx + yy)),
-        -(C3C * x * around),
-        C3E * z * (xx - yy),
-        -(C3A * x * (xx - 3 * yy)),
-    )
-
-
-@inline
 def color(degree, d, sh0, columns):
     """0.5 + Σ coefficient·basis for 16 splats, before the clamp at 0."""
     rgb = simd.fma(sh0[0], C0, 0.5), simd.fma(sh0[1], C0, 0.5), simd.fma(sh0[2], C0, 0.5)
@@ -129,14 +87,12 @@ def color_range(camera, means, colors, bands, ids, first, last, records, scratch
     for start in range(first, last, 16):
         prefetch_sh(shN, ids, start + AHEAD, last, stride, coefficients)
         mean = simd.gather_rows3(means, ids, start)
-        direction, _ = unit_direction(camera, mean)
+        direction, _ = unit_direction(rec.load3(camera, rec.POSITION, 1), mean)
         if degree > 0:
             gather_sh(shN, ids, start, stride, coefficients, scratch)
-        r, g, b = color(degree, direction, simd.gather_rows3(sh0, ids, start), scratch)
-        # This order of arguments keeps NaN, so that the loss shows it.
-        simd.store(scratch, 0, simd.maximum(0, r))
-        simd.store(scratch, 16, simd.maximum(0, g))
-        simd.store(scratch, 32, simd.maximum(0, b))
+        rgb = clamped(color(degree, direction, simd.gather_rows3(sh0, ids, start), scratch))
+        for channel in range(3):
+            simd.store(scratch, 16 * channel, rgb[channel])
         for lane in range(min(16, last - start)):
             o = rec.RECORD * np.int64(simd.get(ids, start + lane)) + rec.RED
             simd.put(records, o, simd.get(scratch, lane))
@@ -147,28 +103,15 @@ def color_range(camera, means, colors, bands, ids, first, last, records, scratch
 @inline
 def direction_gradient(degree, d, e):
     """dL/d(direction) from the scratch vectors ``e[16·k]`` = Σ_channel coefficient·gradient of each band."""
-    x, y, z = d
-    gx, gy, gz = simd.broadcast(0), simd.broadcast(0), simd.broadcast(0)
-    if degree > 0:
-        gx, gy, gz = -(C1 * simd.load(e, 32)), -(C1 * simd.load(e, 0)), C1 * simd.load(e, 16)
+    g = formulas.direction_gradient1((simd.load(e, 0), simd.load(e, 16), simd.load(e, 32)))
     if degree > 1:
-        a, b, c = C2A, C2B, C2C
         e0, e1, e2, e3, e4 = simd.load(e, 48), simd.load(e, 64), simd.load(e, 80), simd.load(e, 96), simd.load(e, 112)
-        gx = gx + a * (y * e0 - z * e3) + 2 * x * (c * e4 - b * e2)
-        gy = gy + a * (x * e0 - z * e1) - 2 * y * (b * e2 + c * e4)
-        gz = gz + 4 * b * z * e2 - a * (y * e1 + x * e3)
+        g = formulas.direction_gradient2(g, d, (e0, e1, e2, e3, e4))
     if degree > 2:
-        a, b, c, f, g = C3A, C3B, C3C, C3D, C3E
         e0, e1, e2, e3 = simd.load(e, 128), simd.load(e, 144), simd.load(e, 160), simd.load(e, 176)
         e4, e5, e6 = simd.load(e, 192), simd.load(e, 208), simd.load(e, 224)
-        xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
-        gx = gx - 6 * a * xy * e0 + b * yz * e1 + 2 * c * xy * e2 - 6 * f * xz * e3
-        gx = gx - c * (4 * zz - 3 * xx - yy) * e4 + 2 * g * xz * e5 - 3 * a * (xx - yy) * e6
-        gy = gy - 3 * a * (xx - yy) * e0 + b * xz * e1 - c * (4 * zz - xx - 3 * yy) * e2
-        gy = gy - 6 * f * yz * e3 + 2 * c * xy * e4 - 2 * g * yz * e5 + 6 * a * xy * e6
-        gz = gz + b * xy * e1 - 2 * 4 * c * (yz * e2 + xz * e4) + 3 * f * (2 * zz - xx - yy) * e3
-        gz = gz + g * (xx - yy) * e5
-    return gx, gy, gz
+        g = formulas.direction_gradient3(g, d, (e0, e1, e2, e3, e4, e5, e6))
+    return g
 
 
 @inline
@@ -202,12 +145,12 @@ def scatter_sh(gradient, columns, ids, start, stride, count):
 def color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, scratch):
     """Gradients of the SH coefficients; returns that of the mean through the viewing direction."""
     stride, degree = bands
-    d, inverse = unit_direction(camera, mean)
+    d, inverse = unit_direction(rec.load3(camera, rec.POSITION, 1), mean)
     coefficients = coefficients_of(degree)
     columns, gradient, e = scratch[:768], scratch[768:1536], scratch[1536:]
     if degree > 0:
         gather_sh(shN, ids, start, stride, coefficients, columns)
-    simd.scatter_rows3(g_sh0, ids, start, rec.scale3(C0, rgb))
+    simd.scatter_rows3(g_sh0, ids, start, scale3(C0, rgb))
     if degree == 0:
         scatter_sh(g_shN, gradient, ids, start, stride, 0)
         return simd.broadcast(0), simd.broadcast(0), simd.broadcast(0)
@@ -223,5 +166,4 @@ def color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, scra
         for i in range(7):
             put_band(gradient, e, columns, 8 + i, b3[i], rgb)
     scatter_sh(g_shN, gradient, ids, start, stride, coefficients)
-    g = direction_gradient(degree, d, e)
-    return rec.scale3(inverse, rec.fma3(-rec.dot3(g, d), d, g))
+    return mean_gradient(d, inverse, direction_gradient(degree, d, e))

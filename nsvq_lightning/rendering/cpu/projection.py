@@ -1,7 +1,4 @@
-"""Projection of splats onto the image plane, 16 at a time.
-
-Equations: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl et al. 2023, sec. 4).
-"""
+"""Projection of splats onto the image plane, 16 at a time."""
 
 import numpy as np
 
@@ -10,114 +7,29 @@ from nsvq_lightning.compute.jit import F, inline, parallel
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import color_range
-from nsvq_lightning.splats import conventions
+from nsvq_lightning.rendering.formulas import (
+    BLUR,
+    BLUR_SQUARED,
+    HUGE_FOOTPRINT,
+    affine,
+    axes_of,
+    cross,
+    dot3,
+    footprint,
+    image_axes,
+    view_point,
+)
 
-BLUR = F(constants.BLUR)
-BLUR_SQUARED = F(constants.BLUR**2)
-MIN_SQUARED_NORM = F(conventions.MIN_SQUARED_NORM)
-FINITE = F(constants.FINITE)
-HUGE_FOOTPRINT, LARGEST_FOOTPRINT = F(constants.HUGE_FOOTPRINT), F(constants.LARGEST_FOOTPRINT)
-HUGE_QUATERNION, SHRINK = F(constants.HUGE_QUATERNION), F(constants.SHRINK)
-LN2 = F(np.log(2.0))
 # Square of the smallest factor by which anti-aliasing dims.
-LEAST_LIGHT = F(constants.FAINTEST**2)
+MIN_LIGHT = F(constants.FAINTEST**2)
 
 
 @inline
-def view_depth(camera, mean):
-    """View-space z of 16 means."""
-    return rec.rotate(camera, 2, mean) + simd.load_one(camera, rec.TRANSLATION + 2)
-
-
-@inline
-def axes_of(quat, log_scales):
-    """Unit quaternion and its inverse norm, axis lengths, and the rows of the matrix M = R·diag(lengths)."""
-    w, x, y, z = quat
-    largest = simd.maximum(simd.maximum(simd.abs(w), simd.abs(x)), simd.maximum(simd.abs(y), simd.abs(z)))
-    shrink = simd.where(largest > HUGE_QUATERNION, SHRINK, 1)
-    w, x, y, z = w * shrink, x * shrink, y * shrink, z * shrink
-    squared = simd.fma(w, w, simd.fma(x, x, simd.fma(y, y, z * z)))
-    inverse = 1 / simd.sqrt(simd.maximum(squared, MIN_SQUARED_NORM))
-    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
-    s0 = simd.exp2_clamped(log_scales[0] * rec.LOG2_E)
-    s1 = simd.exp2_clamped(log_scales[1] * rec.LOG2_E)
-    s2 = simd.exp2_clamped(log_scales[2] * rec.LOG2_E)
-    xx, yy, zz = simd.fma(y, y, z * z), simd.fma(x, x, z * z), simd.fma(x, x, y * y)
-    m0 = simd.fnma(2, xx, 1) * s0, 2 * (x * y - w * z) * s1, 2 * (x * z + w * y) * s2
-    m1 = 2 * (x * y + w * z) * s0, simd.fnma(2, yy, 1) * s1, 2 * (y * z - w * x) * s2
-    m2 = 2 * (x * z - w * y) * s0, 2 * (y * z + w * x) * s1, simd.fnma(2, zz, 1) * s2
-    return (w, x, y, z), inverse * shrink, (s0, s1, s2), (m0, m1, m2)
-
-
-@inline
-def affine_row(camera, k, scale, slope):
-    """Row k of T = J·W, the local affine map: ``scale`` is focal/z, W the rotation."""
-    near, far = rec.load3(camera, rec.ROTATION + 3 * k, 1), rec.load3(camera, rec.ROTATION + 6, 1)
-    return rec.fma3(scale, near, rec.scale3(-(scale * slope), far))
-
-
-@inline
-def affine(camera, mean):
-    """View-space point, 1/z, slopes limited to the frustum, and T = J·W, the two rows of the local affine map."""
-    x = rec.rotate(camera, 0, mean) + simd.load_one(camera, rec.TRANSLATION)
-    y = rec.rotate(camera, 1, mean) + simd.load_one(camera, rec.TRANSLATION + 1)
-    z = view_depth(camera, mean)
-    inverse = 1 / z
-    slope_x = simd.minimum(
-        simd.load_one(camera, rec.HIGH_X), simd.maximum(simd.load_one(camera, rec.LOW_X), x * inverse)
-    )
-    slope_y = simd.minimum(
-        simd.load_one(camera, rec.HIGH_Y), simd.maximum(simd.load_one(camera, rec.LOW_Y), y * inverse)
-    )
-    t0 = affine_row(camera, 0, simd.load_one(camera, rec.FX) * inverse, slope_x)
-    t1 = affine_row(camera, 1, simd.load_one(camera, rec.FY) * inverse, slope_y)
-    return (x, y, z), inverse, (slope_x, slope_y), t0, t1
-
-
-@inline
-def image_axes(t, m):
-    """One row of U = T·M: the splat's axes along one image axis."""
-    m0, m1, m2 = m
-    return (rec.dot3(t, (m0[0], m1[0], m2[0])), rec.dot3(t, (m0[1], m1[1], m2[1])), rec.dot3(t, (m0[2], m1[2], m2[2])))
-
-
-@inline
-def footprint(camera, means, quats, scales, logits):
-    """All of a record except the colour, the tile rectangle, and which of 16 splats can change the image."""
-    (x, y, z), inverse, _, t0, t1 = affine(camera, means)
-    _, _, _, m = axes_of(quats, scales)
-    u, v = image_axes(t0, m), image_axes(t1, m)
-    xx, yy, xy = rec.dot3(u, u), rec.dot3(v, v), rec.dot3(u, v)
-    # |u|²|v|² - (u·v)² = |u × v|² (Lagrange): no cancellation for large splats.
-    size = xx + yy
-    unit = simd.where(size > HUGE_FOOTPRINT, 1 / size, 1)
-    n = rec.scale3(unit, rec.cross(u, v))
-    determinant = rec.dot3(n, n) + simd.fma(BLUR, size, BLUR_SQUARED) * unit * unit
-    xx, yy = xx + BLUR, yy + BLUR
-
-    px = simd.fma(simd.load_one(camera, rec.FX), x * inverse, simd.load_one(camera, rec.CX))
-    py = simd.fma(simd.load_one(camera, rec.FY), y * inverse, simd.load_one(camera, rec.CY))
-    log2_opacity = -simd.log2(1 + simd.exp2_clamped(-(logits * rec.LOG2_E)))
-    # α reaches 1/255 where u² + v² ≤ log2(255 o): a box of half sizes √(2 ln(255 o)·Σ_ii).
-    reach = (log2_opacity - rec.LOG2_ALPHA_MIN) * (F(2) * LN2)
-    half_x, half_y = simd.sqrt(simd.maximum(reach, 0) * xx), simd.sqrt(simd.maximum(reach, 0) * yy)
-    left, right = simd.maximum(simd.ceil(px - half_x - 0.5), 0), simd.floor(px + half_x - 0.5)
-    top, bottom = simd.maximum(simd.ceil(py - half_y - 0.5), 0), simd.floor(py + half_y - 0.5)
-    right = simd.minimum(right, simd.load_one(camera, rec.WIDTH) - 1)
-    bottom = simd.minimum(bottom, simd.load_one(camera, rec.HEIGHT) - 1)
-
-    seen = (z > simd.load_one(camera, rec.NEAR)) & (reach > 0) & (left <= right) & (top <= bottom)
-    seen = seen & (size < LARGEST_FOOTPRINT) & (determinant < FINITE)
-    seen = seen & (simd.abs(px) < FINITE) & (simd.abs(py) < FINITE) & (logits >= -FINITE)
-    # exp2_clamped makes a broken scale finite; the raw one still shows that it is broken.
-    seen = seen & (scales[0] + scales[1] + scales[2] < FINITE)
-
-    slope_y = xy / yy
-    a = rec.FACTOR_SCALE * simd.sqrt(yy * unit / determinant * unit)
-    record = (px, py, a, -(a * slope_y), rec.FACTOR_SCALE / simd.sqrt(yy), log2_opacity, z, xy / xx, slope_y)
-    tile = F(1.0 / rec.TILE)
-    tiles = (simd.floor(left * tile), simd.floor(top * tile), simd.floor(right * tile), simd.floor(bottom * tile))
-    return seen, record, tiles, simd.ceil(simd.maximum(half_x, half_y))
+def load_screen(camera):
+    """The screen of :func:`nsvq_lightning.rendering.formulas.footprint`."""
+    cx, cy = simd.load_one(camera, rec.CX), simd.load_one(camera, rec.CY)
+    width, height = simd.load_one(camera, rec.WIDTH), simd.load_one(camera, rec.HEIGHT)
+    return cx, cy, width, height, simd.load_one(camera, rec.NEAR)
 
 
 @inline
@@ -156,10 +68,12 @@ def project_range(camera, means, quats, scales, logits, first, last, records, in
         count = min(16, last - start)
         mean = load_means(means, start, count, scratch)
         lanes = (1 << count) - 1
-        if simd.mask_bits(view_depth(camera, mean) > simd.load_one(camera, rec.NEAR)) & lanes == 0:
+        view = rec.load_view(camera)
+        point = view_point(view, mean)
+        if simd.mask_bits(point[2] > simd.load_one(camera, rec.NEAR)) & lanes == 0:
             continue
         quat, scale, logit = load_shapes(quats, scales, logits, start, count, scratch)
-        seen, record, tiles, radius = footprint(camera, mean, quat, scale, logit)
+        seen, record, corner, end, radius = footprint(view, load_screen(camera), point, quat, scale, logit)
         bits = simd.mask_bits(seen) & lanes
         if bits == 0:
             continue
@@ -168,8 +82,9 @@ def project_range(camera, means, quats, scales, logits, first, last, records, in
         rows = simd.transpose(fields)
         for lane in range(16):
             simd.store(scratch, 128 + 16 * lane, rows[lane])
-        for k in range(4):
-            simd.store(scratch, 16 * k, tiles[k])
+        for k in range(2):
+            simd.store(scratch, 16 * k, corner[k])
+            simd.store(scratch, 32 + 16 * k, end[k])
         simd.store(scratch, 64, radius)
         while bits != 0:
             lane = simd.lowest_bit(bits)
@@ -246,11 +161,11 @@ def add_colors(thread, threads, camera, means, colors, bands, ids, count, record
 @inline
 def light(u, v):
     """The light that the blur leaves, squared; det Σ, the sum of the variances, what the blur adds to det Σ, u × v."""
-    n = rec.cross(u, v)
-    area, size = rec.dot3(n, n), rec.dot3(u, u) + rec.dot3(v, v)
+    n = cross(u, v)
+    area, size = dot3(n, n), dot3(u, u) + dot3(v, v)
     added = BLUR * size + BLUR_SQUARED
     squared = simd.where(size < HUGE_FOOTPRINT, area / (area + added), 1)
-    return simd.maximum(squared, LEAST_LIGHT), area, size, added, n
+    return simd.maximum(squared, MIN_LIGHT), area, size, added, n
 
 
 @parallel
@@ -258,7 +173,8 @@ def keep_light(thread, threads, camera, means, quats, scales, ids, count, factor
     """Factors ``[count]`` of the splats ``ids``; both arrays have room for a last, incomplete vector."""
     first, last = rec.vector_range(count, thread, threads)
     for start in range(first, last, 16):
-        _, _, _, t0, t1 = affine(camera, simd.gather_rows3(means, ids, start))
+        view = rec.load_view(camera)
+        _, _, t0, t1 = affine(view, view_point(view, simd.gather_rows3(means, ids, start)))
         _, _, _, m = axes_of(simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start))
         squared, _, _, _, _ = light(image_axes(t0, m), image_axes(t1, m))
         simd.store(factors, start, simd.sqrt(squared))

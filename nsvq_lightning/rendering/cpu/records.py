@@ -10,15 +10,15 @@ group sums the gradients of one splat. Slots are numbered splat by splat, so tha
 fixed order, whichever thread processed which group: results have the same bits for any number of threads.
 """
 
-import math
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline
+from nsvq_lightning.compute.jit import inline
 from nsvq_lightning.compute.memory import Array
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.formulas import TILE
 
 # Floats in a record and in a slot.
 RECORD = 16
@@ -33,9 +33,6 @@ X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, SLOPE_X, SLOPE_Y, SLOT, OR
 SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_DEPTH, ABS_X, ABS_Y, SUM_WEIGHT = range(
     13
 )
-
-TILE_SHIFT = 4
-TILE = 1 << TILE_SHIFT
 
 # Elements of the camera array of `pack_camera`.
 ROTATION, TRANSLATION, POSITION, FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, WIDTH, HEIGHT, NEAR = (
@@ -75,36 +72,6 @@ def group_grid(width: int, height: int) -> tuple[int, int]:
     return -(-width // side), -(-height // side)
 
 
-LOG2_ALPHA_MIN = F(-math.log2(255))
-LOG2_E = F(math.log2(math.e))
-# √(½·log2 e): turns the Cholesky factor of the inverse covariance into that of the binary exponent.
-FACTOR_SCALE = F(math.sqrt(0.5 * math.log2(math.e)))
-
-
-@inline
-def dot3(a, b):
-    """Dot product of two vectors."""
-    return simd.fma(a[0], b[0], simd.fma(a[1], b[1], a[2] * b[2]))
-
-
-@inline
-def scale3(k, v):
-    """The vector k·v."""
-    return k * v[0], k * v[1], k * v[2]
-
-
-@inline
-def times3(v, w):
-    """The products of the components of two vectors."""
-    return v[0] * w[0], v[1] * w[1], v[2] * w[2]
-
-
-@inline
-def fma3(k, v, w):
-    """The vector k·v + w."""
-    return simd.fma(k, v[0], w[0]), simd.fma(k, v[1], w[1]), simd.fma(k, v[2], w[2])
-
-
 @inline
 def load3(array, offset, stride):
     """A vector that is the same for all splats."""
@@ -113,21 +80,13 @@ def load3(array, offset, stride):
 
 
 @inline
-def rotate(camera, row, v):
-    """One row of the camera rotation times a vector."""
-    return dot3(load3(camera, ROTATION + 3 * row, 1), v)
-
-
-@inline
-def rotate_back(camera, column, v):
-    """One column of the camera rotation times a vector."""
-    return dot3(load3(camera, ROTATION + column, 3), v)
-
-
-@inline
-def cross(u, v):
-    """The vector product u × v."""
-    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+def load_view(camera):
+    """The view of :mod:`nsvq_lightning.rendering.formulas`."""
+    rotation = load3(camera, ROTATION, 1), load3(camera, ROTATION + 3, 1), load3(camera, ROTATION + 6, 1)
+    focal = simd.load_one(camera, FX), simd.load_one(camera, FY)
+    slopes_x = simd.load_one(camera, LOW_X), simd.load_one(camera, HIGH_X)
+    slopes_y = simd.load_one(camera, LOW_Y), simd.load_one(camera, HIGH_Y)
+    return rotation, load3(camera, TRANSLATION, 1), focal, slopes_x, slopes_y
 
 
 @inline

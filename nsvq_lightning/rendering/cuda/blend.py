@@ -15,11 +15,15 @@ import triton.language as tl
 from torch import Tensor
 
 from nsvq_lightning.compute.devices import COMPILE
+from nsvq_lightning.compute.formulas import for_triton
 from nsvq_lightning.compute.memory import check_tensor
+from nsvq_lightning.rendering import formulas as shared
 from nsvq_lightning.rendering.cuda import records as rec
 from nsvq_lightning.rendering.cuda.binning import Tiles
 from nsvq_lightning.rendering.cuda.harmonics import load3
 from nsvq_lightning.rendering.cuda.projection import Lens
+
+formulas = for_triton(shared)
 
 
 @triton.jit
@@ -43,29 +47,16 @@ def fetch(records, ranks, j, end):
 
 
 @triton.jit
-def alpha_at(fetched, left, top, x, y):
-    """α of a splat before the cap, 0 below 1/255, and the two factors of its exponent, at pixels of a tile."""
-    _, a, b, c, px, py, log2_opacity = fetched
-    px, py = px - left, py - top
-    # Explicit, so that both passes round alike: the compiler may contract sums of products, or not.
-    u = tl.fma(a, x, tl.fma(b, y, -tl.fma(a, px, b * py)))
-    v = tl.fma(c, y, -(c * py))
-    power = tl.fma(-u, u, tl.fma(-v, v, log2_opacity))
-    return tl.where(power >= rec.LOG2_ALPHA_MIN, tl.exp2(power), 0.0), u, v
-
-
-@triton.jit
 def blend_step(fetched, left, top, x, y, t):
     """What one splat does to pixels with transmittance ``t``, the same to the bit in the forward and backward pass.
 
-    Returns α before the cap, the two factors of its exponent, α, the transmittance after it, whether that leaves the
-    pixel open, and the weight of the splat's colour.
+    Returns the two factors of its exponent and what :func:`nsvq_lightning.rendering.formulas.blend_step` does.
     """
-    raw, u, v = alpha_at(fetched, left, top, x, y)
-    alpha = tl.minimum(raw, rec.ALPHA_MAX)
-    after = tl.fma(-alpha, t, t)
-    is_open = after >= rec.TRANSMITTANCE_MIN
-    return raw, u, v, alpha, after, is_open, tl.where(is_open, alpha * t, 0.0)
+    _, a, b, c, px, py, log2_opacity = fetched
+    px, py = px - left, py - top
+    # Explicit, so that both passes round alike: the compiler may contract sums of products, or not.
+    power, u, v = formulas.exponent(a, b, c, -tl.fma(a, px, b * py), -(c * py), log2_opacity, x, y)
+    return u, v, formulas.blend_step(power, t)
 
 
 @triton.jit
@@ -88,14 +79,15 @@ def blend_kernel(
         for j in range(i, looked):
             fetched, following = following, fetch(records, ranks, j + 1, end)
             record = fetched[0]
-            _, _, _, _, after, is_open, weight = blend_step(fetched, left, top, x, y, t)
+            _, _, step = blend_step(fetched, left, top, x, y, t)
+            _, _, after, is_open, weight = step
             kept = tl.where(is_open, after, kept)
             t = after
             red += weight * tl.load(record + rec.RED)
             green += weight * tl.load(record + rec.GREEN)
             blue += weight * tl.load(record + rec.BLUE)
             far += weight * tl.load(record + rec.DEPTH)
-        i = tl.where(tl.max(t, 0) >= rec.TRANSMITTANCE_MIN, looked, end)
+        i = tl.where(tl.max(t, 0) >= formulas.TRANSMITTANCE_MIN, looked, end)
     tl.store(ends + tile, looked)
     tl.store(image + 3 * pixel, red + kept * tl.load(background), mask=inside)
     tl.store(image + 3 * pixel + 1, green + kept * tl.load(background + 1), mask=inside)
@@ -134,14 +126,15 @@ def blend_backward_kernel(
     for j in range(begin, end):
         fetched, following = following, fetch(records, ranks, j + 1, end)
         record = fetched[0]
-        raw, u, v, alpha, after, is_open, weight = blend_step(fetched, left, top, x, y, t)
+        u, v, step = blend_step(fetched, left, top, x, y, t)
+        raw, alpha, after, is_open, weight = step
         if tl.max(weight, 0) > 0:
             d = g_red * tl.load(record + rec.RED) + g_green * tl.load(record + rec.GREEN)
             d += g_blue * tl.load(record + rec.BLUE)
             if WITH_DEPTH:
                 d += g_far * tl.load(record + rec.DEPTH)
             # The cap of α has no gradient.
-            h = tl.where(is_open & (raw <= rec.ALPHA_MAX), alpha / (1 - alpha) * (t * d - rest), 0.0)
+            h = tl.where(is_open & (raw <= formulas.ALPHA_MAX), alpha / (1 - alpha) * (t * d - rest), 0.0)
             rest = tl.fma(-weight, d, rest)
             hu, hv = h * u, h * v
             slot = sums + tl.load(slots + j).to(tl.int64) * (rec.ABSGRAD_SLOT if WITH_ABSGRAD else rec.RECORD)
@@ -199,11 +192,11 @@ def total_kernel(
     a, b = tl.load(record + rec.A, mask=seen, other=0.0), tl.load(record + rec.B, mask=seen, other=0.0)
     c = tl.load(record + rec.C, mask=seen, other=0.0)
     row = tl.load(ids + rank, mask=seen, other=0)
-    tl.store(g_means2d + 2 * row, a * u * (2 * rec.LN2), mask=seen)
-    tl.store(g_means2d + 2 * row + 1, (b * u + c * v) * (2 * rec.LN2), mask=seen)
+    tl.store(g_means2d + 2 * row, a * u * formulas.TWO_LN2, mask=seen)
+    tl.store(g_means2d + 2 * row + 1, (b * u + c * v) * formulas.TWO_LN2, mask=seen)
     if WITH_ABSGRAD:
-        tl.store(absgrad + 3 * row, tl.abs(a) * field_of(total, rec.ABS_X) * (2 * rec.LN2), mask=seen)
-        tl.store(absgrad + 3 * row + 1, field_of(total, rec.ABS_Y) * (2 * rec.LN2), mask=seen)
+        tl.store(absgrad + 3 * row, tl.abs(a) * field_of(total, rec.ABS_X) * formulas.TWO_LN2, mask=seen)
+        tl.store(absgrad + 3 * row + 1, field_of(total, rec.ABS_Y) * formulas.TWO_LN2, mask=seen)
         tl.store(absgrad + 3 * row + 2, field_of(total, rec.SUM_WEIGHT), mask=seen)
 
 

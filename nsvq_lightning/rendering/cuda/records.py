@@ -11,12 +11,9 @@ consecutive, so that its total is summed in one fixed order and no kernel needs 
 every time.
 """
 
-import math
-
 import triton.language as tl
 
-from nsvq_lightning.rendering import constants
-from nsvq_lightning.splats import conventions
+from nsvq_lightning.rendering import formulas
 
 # Stride between records, or slots, in floats: whole 16-byte words.
 RECORD = tl.constexpr(12)
@@ -37,23 +34,4 @@ SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_D
 )
 
 # Side of a tile in pixels.
-TILE = tl.constexpr(16)
-
-LN2 = tl.constexpr(math.log(2.0))
-LOG2_E = tl.constexpr(math.log2(math.e))
-LOG2_ALPHA_MIN = tl.constexpr(math.log2(constants.ALPHA_MIN))
-ALPHA_MAX = tl.constexpr(constants.ALPHA_MAX)
-TRANSMITTANCE_MIN = tl.constexpr(constants.TRANSMITTANCE_MIN)
-# √(½·log2 e): turns the Cholesky factor of the inverse covariance into that of the binary exponent.
-FACTOR_SCALE = tl.constexpr(math.sqrt(0.5 * math.log2(math.e)))
-# Converts moments of the scaled factor to dL/dΣ: ½ / (½ log2 e)².
-COVARIANCE_SCALE = tl.constexpr(2 * math.log(2.0) ** 2)
-# The rest of what kernels take from the constants that all back-ends share.
-BLUR = tl.constexpr(constants.BLUR)
-BLUR_SQUARED = tl.constexpr(constants.BLUR**2)
-FRUSTUM_MARGIN = tl.constexpr(constants.FRUSTUM_MARGIN)
-MIN_SQUARED_NORM = tl.constexpr(conventions.MIN_SQUARED_NORM)
-FINITE = tl.constexpr(constants.FINITE)
-HUGE_FOOTPRINT = tl.constexpr(constants.HUGE_FOOTPRINT)
-LARGEST_FOOTPRINT = tl.constexpr(constants.LARGEST_FOOTPRINT)
-HUGE_QUATERNION, SHRINK = tl.constexpr(constants.HUGE_QUATERNION), tl.constexpr(constants.SHRINK)
+TILE = tl.constexpr(formulas.TILE)
