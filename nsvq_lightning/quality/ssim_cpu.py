@@ -15,11 +15,11 @@ from torch import Tensor
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat_checked, recycled
-from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
+from nsvq_lightning.quality import formulas
+from nsvq_lightning.quality.ssim import SSIM_RADIUS, check_pair, ssim_window
 
 # The taps of the window, from the middle outwards.
 TAPS = tuple(F(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
-C1, C2 = F(SSIM_C1), F(SSIM_C2)
 # Zeros beside every row, at least 3·radius floats, so that the horizontal blur needs no special case at the border.
 PAD = 16
 RING = 2 * SSIM_RADIUS + 1
@@ -51,9 +51,7 @@ def take_row(image, target, white, images, y, height, length, pitch):
         for x_ in range(0, length, 16):
             # The last vector of a row overlaps the one before it instead of running past the end.
             x = min(x_, length - 16)
-            p = simd.load(image, y * length + x)
-            # Not minimum and maximum: NaN must stay NaN.
-            simd.store(images, o + x, simd.where(p < 0, 0, simd.where(p > 1, 1, p)))
+            simd.store(images, o + x, formulas.clamped(simd.load(image, y * length + x)))
         for x in range(length):
             simd.put(images, o + pitch + x, F(simd.get(target, y * length + x)) / white)
 
@@ -68,18 +66,13 @@ def blur_along(row, o):
 
 
 @inline
-def add_pair(images, y, distance, x, pitch, weight, sums):
-    """Add the moments (p, q, p² + q², p·q) of the rows ``distance`` above and below row y, which share a tap."""
+def add_pair(images, y, distance, x, pitch, tap, sums):
+    """Add the moments of the rows ``distance`` above and below row y, which share a tap."""
     above = row_of(y - distance, IMAGES, pitch) + x
     below = row_of(y + distance, IMAGES, pitch) + x
     p, q = simd.load(images, above), simd.load(images, above + pitch)
     r, s = simd.load(images, below), simd.load(images, below + pitch)
-    return (
-        simd.fma(weight, p + r, sums[0]),
-        simd.fma(weight, q + s, sums[1]),
-        simd.fma(weight, simd.fma(p, p, r * r) + simd.fma(q, q, s * s), sums[2]),
-        simd.fma(weight, simd.fma(p, q, r * s), sums[3]),
-    )
+    return formulas.add_moments(sums, tap, p, q, r, s)
 
 
 @inline
@@ -88,8 +81,7 @@ def moments_of_row(images, y, length, pitch, moments):
     for x_ in range(0, length, 16):
         x = min(x_, length - 16)
         o = row_of(y, IMAGES, pitch) + x
-        p, q = simd.load(images, o), simd.load(images, o + pitch)
-        sums = (TAPS[0] * p, TAPS[0] * q, TAPS[0] * simd.fma(p, p, q * q), TAPS[0] * (p * q))
+        sums = formulas.moments(TAPS[0], simd.load(images, o), simd.load(images, o + pitch))
         for distance in range(1, SSIM_RADIUS + 1):
             sums = add_pair(images, y, distance, x, pitch, TAPS[distance], sums)
         simd.store(moments, PAD + x, sums[0])
@@ -107,18 +99,8 @@ def similarity_of_row(moments, derivatives, length, pitch, lanes):
         x = min(x_, length - 16)
         o = PAD + x
         m1, m2 = blur_along(moments, o), blur_along(moments, pitch + o)
-        m12 = m1 * m2
-        squares = simd.fma(m1, m1, m2 * m2)
-        variances = blur_along(moments, 2 * pitch + o) - squares
-        covariance = blur_along(moments, 3 * pitch + o) - m12
-        a, d = simd.fma(2, m12, C1), simd.fma(2, covariance, C2)
-        e, f = squares + C1, variances + C2
-        ef = 1 / (e * f)
-        e, f = f * ef, e * ef
-        similarity = a * d * ef
-        by_product = 2 * a * ef
-        by_square = -(similarity * f)
-        by_mean = 2 * (m2 * d * ef - m1 * similarity * e - m1 * by_square) - m2 * by_product
+        squares, product = blur_along(moments, 2 * pitch + o), blur_along(moments, 3 * pitch + o)
+        similarity, by_mean, by_square, by_product = formulas.similarity(m1, m2, squares, product)
         simd.store(derivatives, o, by_mean)
         simd.store(derivatives, pitch + o, by_square)
         simd.store(derivatives, 2 * pitch + o, by_product)
@@ -152,13 +134,11 @@ def gradient_of_row(image, gradient, images, ring, y, length, pitch, l1_step, ss
         x = min(x_, length - 16)
         o = row_of(y, IMAGES, pitch) + x
         p, q = simd.load(images, o), simd.load(images, o + pitch)
-        g = blur_across(ring, y, 0, PAD + x, pitch)
-        g = simd.fma(2 * p, blur_across(ring, y, 1, PAD + x, pitch), g)
-        g = simd.fma(q, blur_across(ring, y, 2, PAD + x, pitch), g)
-        sign = simd.where(p > q, l1_step, simd.where(p < q, -l1_step, 0))
         raw = simd.load(image, y * length + x)
-        inside = (raw >= 0) & (raw <= 1)
-        simd.store(gradient, y * length + x, simd.where(inside, simd.fnma(ssim_step, g, sign), 0))
+        by_mean, by_square = blur_across(ring, y, 0, PAD + x, pitch), blur_across(ring, y, 1, PAD + x, pitch)
+        by_product = blur_across(ring, y, 2, PAD + x, pitch)
+        g = formulas.pixel_gradient(raw, p, q, by_mean, by_square, by_product, l1_step, ssim_step)
+        simd.store(gradient, y * length + x, g)
         total = total + simd.where(lane >= F(x_ - x), simd.abs(p - q), 0)
     return simd.lane_sum(total)
 

@@ -14,8 +14,12 @@ import triton.language as tl
 from torch import Tensor
 
 from nsvq_lightning.compute.devices import COMPILE
+from nsvq_lightning.compute.formulas import for_triton
 from nsvq_lightning.compute.memory import check_tensor
-from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2, SSIM_RADIUS, check_pair, ssim_window
+from nsvq_lightning.quality import formulas as shared
+from nsvq_lightning.quality.ssim import SSIM_RADIUS, check_pair, ssim_window
+
+formulas = for_triton(shared)
 
 
 @triton.jit
@@ -35,14 +39,12 @@ def load_at(plane, row, column, height, length):
 
 @triton.jit
 def clamped(image, row, column, height, length):
-    """The image clamped to [0, 1]; not by minimum and maximum, since NaN must stay NaN."""
-    raw = load_at(image, row, column, height, length)
-    return tl.where(raw < 0, 0.0, tl.where(raw > 1, 1.0, raw))
+    """The image clamped to [0, 1]."""
+    return formulas.clamped(load_at(image, row, column, height, length))
 
 
 # The taps of the window, from the middle outwards.
 TAPS, RADIUS = tl.constexpr(tuple(ssim_window()[SSIM_RADIUS:].tolist())), tl.constexpr(SSIM_RADIUS)
-C1, C2 = tl.constexpr(SSIM_C1), tl.constexpr(SSIM_C2)
 WHITE = tl.constexpr(255.0)
 
 
@@ -58,15 +60,10 @@ def photo(target, row, column, height, length, BYTES: tl.constexpr):
 
 @triton.jit
 def add_moments(sums, image, target, row, column, height, length, k, tap, BYTES: tl.constexpr):
-    """Add the moments (p, q, p² + q², p·q) of the rows k above and below, which share a tap."""
+    """Add the moments of the rows k above and below, which share a tap."""
     p, q = clamped(image, row - k, column, height, length), photo(target, row - k, column, height, length, BYTES)
     r, s = clamped(image, row + k, column, height, length), photo(target, row + k, column, height, length, BYTES)
-    return (
-        sums[0] + (p + r) * tap,
-        sums[1] + (q + s) * tap,
-        sums[2] + (p * p + r * r + q * q + s * s) * tap,
-        sums[3] + (p * q + r * s) * tap,
-    )
+    return formulas.add_moments(sums, tap, p, q, r, s)
 
 
 @triton.jit
@@ -78,7 +75,7 @@ def moments_kernel(
     p, q = clamped(image, row, column, height, length), photo(target, row, column, height, length, BYTES)
     # Beyond the border both are 0.
     tl.store(sums + 2 * program, tl.sum(tl.sum(tl.abs(p - q), 1), 0))
-    blurred = (p * TAPS[0], q * TAPS[0], (p * p + q * q) * TAPS[0], p * q * TAPS[0])
+    blurred = formulas.moments(TAPS[0], p, q)
     for k in tl.static_range(1, RADIUS + 1):
         blurred = add_moments(blurred, image, target, row, column, height, length, k, TAPS[k], BYTES)
     inside = (row < height) & (column < length)
@@ -120,18 +117,11 @@ def similarity_kernel(
     size = tl.cast(height, tl.int64) * length
     m1 = blur_along(moments, row, column, height, length)
     m2 = blur_along(moments + size, row, column, height, length)
-    m12, squares = m1 * m2, m1 * m1 + m2 * m2
-    variances = blur_along(moments + 2 * size, row, column, height, length) - squares
-    covariance = blur_along(moments + 3 * size, row, column, height, length) - m12
-    a, d = m12 * 2 + C1, covariance * 2 + C2
-    e, f = squares + C1, variances + C2
-    inverse = 1 / (e * f)
-    similarity = a * d * inverse
+    squares = blur_along(moments + 2 * size, row, column, height, length)
+    product = blur_along(moments + 3 * size, row, column, height, length)
+    similarity, by_mean, by_square, by_product = formulas.similarity(m1, m2, squares, product)
     tl.store(sums + 2 * program + 1, tl.sum(tl.sum(tl.where(inside, similarity, 0.0), 1), 0))
     if DERIVED:
-        by_product = a * inverse * 2
-        by_square = -(similarity * e * inverse)
-        by_mean = (m2 * d * inverse - m1 * similarity * f * inverse - m1 * by_square) * 2 - m2 * by_product
         at = derivatives + row.to(tl.int64) * length + column
         tl.store(at, by_mean, mask=inside)
         tl.store(at + size, by_square, mask=inside)
@@ -171,12 +161,10 @@ def gradient_kernel(
     size = tl.cast(height, tl.int64) * length
     raw = load_at(image, row, column, height, length)
     p, q = clamped(image, row, column, height, length), photo(target, row, column, height, length, BYTES)
-    g = blur_along(blurred, row, column, height, length)
-    g += blur_along(blurred + size, row, column, height, length) * p * 2
-    g += blur_along(blurred + 2 * size, row, column, height, length) * q
-    sign = tl.where(p > q, 1.0, tl.where(p < q, -1.0, 0.0))
-    free = (raw >= 0) & (raw <= 1)
-    value = tl.where(free, (sign * l1_step - g * ssim_step) * tl.load(scale), 0.0)
+    by_mean = blur_along(blurred, row, column, height, length)
+    by_square = blur_along(blurred + size, row, column, height, length)
+    by_product = blur_along(blurred + 2 * size, row, column, height, length)
+    value = formulas.pixel_gradient(raw, p, q, by_mean, by_square, by_product, l1_step, ssim_step) * tl.load(scale)
     at = row.to(tl.int64) * length + column
     tl.store(gradient + at, value, mask=(row < height) & (column < length))
 

@@ -8,10 +8,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+import nsvq_lightning.quality.formulas
 import nsvq_lightning.rendering.formulas
 from nsvq_lightning.compute.formulas import for_triton
 
-BOTH = (nsvq_lightning.rendering.formulas,)
+BOTH = nsvq_lightning.rendering.formulas, nsvq_lightning.quality.formulas
 
 
 @pytest.mark.parametrize("formulas", BOTH)
