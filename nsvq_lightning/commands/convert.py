@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from nsvq_lightning.commands.arguments import views_of
@@ -30,6 +29,7 @@ from nsvq_lightning.io.compressed import UP_AXES, CompressedScene
 from nsvq_lightning.io.describe import attribute_errors
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.sog import PALETTE_LIMIT
+from nsvq_lightning.splats.conventions import Float64s
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -146,7 +146,7 @@ def _edited(scene: CompressedScene, options: argparse.Namespace) -> CompressedSc
     return scene.in_use() if len(scene) < before else scene
 
 
-def _up(options: argparse.Namespace) -> NDArray[np.float64]:
+def _up(options: argparse.Namespace) -> Float64s:
     """Where up is in the input, a unit vector ``[3]``."""
     if options.up_from is None:
         from nsvq_lightning.data.scene import load_scene

@@ -24,6 +24,7 @@ from nsvq_lightning.io.compressed import turn_up
 from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.poses import up_of
+from nsvq_lightning.splats.conventions import Bools, Float64s, Uint8s
 
 BLOCK = "block.json"
 
@@ -44,7 +45,7 @@ class Block:
     around: Sequence[Sequence[float]]
     scene: str
 
-    def contains(self, points: NDArray[np.floating[Any]], share: float = 0.0) -> NDArray[np.bool_]:
+    def contains(self, points: NDArray[np.floating[Any]], share: float = 0.0) -> Bools:
         """Which points ``[N, 3]`` are in its core, or up to a share of the way to the end of its surroundings.
 
         Cores have no point in common, and each point is in one.
@@ -66,14 +67,13 @@ class Block:
             raise SceneError(f"{folder} is no part of a scene ({error}): make it anew with 'nsvq split'") from None
 
 
-Floats = NDArray[np.float64]
 # Points up to so many times as far as the nearest one in the cell count as in front, too.
 FRONT = 1.05
 # Rows of points, and the cell of a picture that each is in.
 _Front = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
-def points_in_front(points: Floats, camera: Camera) -> _Front:
+def points_in_front(points: Float64s, camera: Camera) -> _Front:
     """Rows of the points ``[P, 3]`` that no nearer ones hide from a camera, and the cell of its picture of each.
 
     Cells are numbered row by row.
@@ -127,7 +127,7 @@ def cut(scene: Scene, count: int) -> list[Block]:
     ground = points @ axes.T
     root = str(scene.root.resolve())
 
-    def parts(some: NDArray[np.bool_], core: Floats, around: Floats, number: int) -> list[Block]:
+    def parts(some: Bools, core: Float64s, around: Float64s, number: int) -> list[Block]:
         places, weights = ground[some], shown[some]
         if np.count_nonzero(weights) < 4 * number:
             raise SceneError(f"the photos show too few points of {scene.root} for {count} parts: ask for fewer")
@@ -153,7 +153,7 @@ def cut(scene: Scene, count: int) -> list[Block]:
     return parts(np.ones(len(points), bool), everywhere, everywhere, count)
 
 
-def _quantiles(values: Floats, weights: Floats, shares: Sequence[float] | Floats) -> Floats:
+def _quantiles(values: Float64s, weights: Float64s, shares: Sequence[float] | Float64s) -> Float64s:
     order = values.argsort()
     sums = weights[order].cumsum()
     return np.asarray(values[order][np.searchsorted(sums, np.array(shares) * sums[-1])])
@@ -163,7 +163,7 @@ def _quantiles(values: Floats, weights: Floats, shares: Sequence[float] | Floats
 _SEAM = 0.3
 
 
-def near_seams(points: Floats, blocks: Sequence[Block]) -> NDArray[np.bool_]:
+def near_seams(points: Float64s, blocks: Sequence[Block]) -> Bools:
     """Which points ``[P, 3]`` lie where two parts meet."""
     return np.asarray(sum(block.contains(points, _SEAM).astype(int) for block in blocks) > 1)
 
@@ -220,7 +220,7 @@ def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path])
     return [(len(found["train"]), len(found["test"])) for found in frames]
 
 
-def shown(front: _Front, inside: NDArray[np.bool_], camera: Camera) -> NDArray[np.bool_]:
+def shown(front: _Front, inside: Bools, camera: Camera) -> Bools:
     """Pixels ``[H, W]`` of a picture that show some points.
 
     Args:
@@ -239,9 +239,7 @@ def shown(front: _Front, inside: NDArray[np.bool_], camera: Camera) -> NDArray[n
     return np.kron(grid, np.ones((size, size), np.uint8))[: camera.height, : camera.width].astype(bool)
 
 
-def _write_photo(
-    folder: Path, index: int, image: NDArray[np.uint8], mask: NDArray[np.bool_], camera: Camera
-) -> dict[str, Any]:
+def _write_photo(folder: Path, index: int, image: Uint8s, mask: Bools, camera: Camera) -> dict[str, Any]:
     """Write what a photo shows of a part, and its mask; returns its frame in ``transforms.json``."""
     top, bottom = np.flatnonzero(mask.any(1))[[0, -1]]
     left, right = np.flatnonzero(mask.any(0))[[0, -1]]

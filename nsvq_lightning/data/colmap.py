@@ -15,12 +15,12 @@ from typing import Any, TypeVar
 import cv2  # noqa: F401  (before pycolmap, see import_pycolmap)
 import numpy as np
 import PIL.Image
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.data import NO_FOLDER
 from nsvq_lightning.data import colmap_tables as tables
 from nsvq_lightning.data.pinhole import Pinhole
+from nsvq_lightning.splats.conventions import Float64s, Int64s, Uint8s
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ class ColmapImage:
 
     name: str
     camera_id: int
-    viewmat: NDArray[np.float64]
+    viewmat: Float64s
     mask: Path | None = None
 
 
@@ -72,9 +72,9 @@ class ColmapModel:
 
     images: tuple[ColmapImage, ...]
     cameras: dict[int, Any]
-    points: NDArray[np.float64]
-    colors: NDArray[np.uint8]
-    observations: NDArray[np.int64] | None = None
+    points: Float64s
+    colors: Uint8s
+    observations: Int64s | None = None
     source: str = "COLMAP"
     images_folder: str | None = None
     test: tuple[int, ...] | None = None
@@ -246,7 +246,7 @@ def _table(path: Path, read: Callable[[Path], _Rows]) -> _Rows:
     return rows
 
 
-def _viewmats(rows: Sequence[tables.ImageRow], path: Path) -> NDArray[np.float64]:
+def _viewmats(rows: Sequence[tables.ImageRow], path: Path) -> Float64s:
     """World to camera ``[V, 4, 4]``.
 
     Raises:
@@ -312,7 +312,7 @@ def lens(number: int, model: str, width: int, height: int, params: tuple[float, 
     return pycolmap.Camera(model=model, width=width, height=height, params=list(params), camera_id=number)
 
 
-def rgb_bytes(values: NDArray[np.float64], floats: bool = False) -> NDArray[np.uint8]:
+def rgb_bytes(values: Float64s, floats: bool = False) -> Uint8s:
     """Colours ``[P, 3]`` of any kind as bytes: in [0, 1] if they are fractions, in [0, 255], or of 16 bits.
 
     Args:
@@ -329,7 +329,7 @@ def rgb_bytes(values: NDArray[np.float64], floats: bool = False) -> NDArray[np.u
     return (values * scale).clip(0, 255).round().astype(np.uint8)
 
 
-def alignment(model: ColmapModel, other: ColmapModel) -> NDArray[np.float64]:
+def alignment(model: ColmapModel, other: ColmapModel) -> Float64s:
     """The similarity ``[4, 4]`` that takes the camera centres of a model nearest to those of another, by photo name.
 
     Raises:
@@ -382,7 +382,7 @@ def larger_models(root: Path) -> str | None:
     return f"sparse/0 has {first} images, {', '.join(larger)}: {advice}" if larger else None
 
 
-def _observations(rows: Sequence[tables.ImageRow], tracks: Sequence[Sequence[int]]) -> NDArray[np.int64]:
+def _observations(rows: Sequence[tables.ImageRow], tracks: Sequence[Sequence[int]]) -> Int64s:
     """Pairs of point row and image row, each once: a track may have two features in one image."""
     row_of = {image.number: row for row, image in enumerate(rows)}
     sightings = [(point, image) for point, track in enumerate(tracks) for image in track]

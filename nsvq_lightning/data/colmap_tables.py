@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+
+from nsvq_lightning.splats.conventions import Float64s
 
 
 class CameraRow(NamedTuple):
@@ -44,8 +45,8 @@ class PointTable(NamedTuple):
         tracks: Identifiers of the images that saw each point; none unless requested.
     """
 
-    xyz: NDArray[np.float64]
-    rgb: NDArray[np.float64]
+    xyz: Float64s
+    rgb: Float64s
     tracks: Sequence[Sequence[int]]
 
 

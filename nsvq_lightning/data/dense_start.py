@@ -7,7 +7,6 @@ from typing import NamedTuple, TypeVar
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
@@ -17,41 +16,41 @@ from nsvq_lightning.data.edges import edges_of
 from nsvq_lightning.data.images import resized_mask
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.random import draw_rows, generator
+from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Uint8s
 
-Floats = NDArray[np.float64]
 T = TypeVar("T")
 
 
 class _Photo(NamedTuple):
     """A train photo at the size of its flow, and its pinhole camera."""
 
-    image: NDArray[np.uint8]
-    grey: NDArray[np.uint8]
-    detail: NDArray[np.uint8]
+    image: Uint8s
+    grey: Uint8s
+    detail: Uint8s
     """Strength of the edges ``[h, w]``."""
-    counts: NDArray[np.bool_] | None
+    counts: Bools | None
     """Which pixels count ``[h, w]``; None for all."""
-    focal: Floats
-    centre: Floats
-    rotation: Floats
+    focal: Float64s
+    centre: Float64s
+    rotation: Float64s
     """World to camera ``[3, 3]``."""
-    position: Floats
+    position: Float64s
     depth: float
     """Median depth of the SfM points in front of the camera, scene units."""
 
-    def project(self, points: Floats) -> tuple[Floats, Floats]:
+    def project(self, points: Float64s) -> tuple[Float64s, Float64s]:
         """Pixels ``[M, 2]`` and depths ``[M]`` of points ``[M, 3]``."""
         x = (points - self.position) @ self.rotation.T
         return x[:, :2] / x[:, 2:] * self.focal + self.centre, x[:, 2]
 
-    def rays(self, pixels: Floats) -> Floats:
+    def rays(self, pixels: Float64s) -> Float64s:
         """Unit directions ``[M, 3]`` in the world of pixels ``[M, 2]``."""
         local = np.concatenate([(pixels - self.centre) / self.focal, np.ones((len(pixels), 1))], 1)
         return np.asarray(local / np.linalg.norm(local, axis=1, keepdims=True) @ self.rotation, np.float64)
 
 
 # Triangulated pixels: positions ``[M, 3]``, colours ``[M, 3]`` and detail ``[M]``, both in bytes.
-_Points = tuple[Floats, NDArray[np.uint8], NDArray[np.uint8]]
+_Points = tuple[Float64s, Uint8s, Uint8s]
 
 
 # Candidates over all flows; of more pixels than that, every third, fourth, ... row and column is taken.
@@ -127,7 +126,7 @@ def _shown(what: str, results: Iterable[T], of: Sized) -> Iterable[T]:
 LONGEST = 800
 
 
-def _photo(scene: Scene, index: int, known: Floats) -> _Photo:
+def _photo(scene: Scene, index: int, known: Float64s) -> _Photo:
     camera, (image, mask) = scene.cameras[index], scene.images[index]
     scale = min(1.0, LONGEST / max(camera.width, camera.height))
     width, height = round(camera.width * scale), round(camera.height * scale)
@@ -190,7 +189,7 @@ def _triangulated(pair: tuple[_Photo, _Photo], stride: int) -> list[_Points]:
 MOST_ERROR, LEAST_PARALLAX, DEPTHS = 0.7, 1.0, (0.1, 20.0)
 
 
-def _followed(a: _Photo, b: _Photo, there: NDArray[np.float32], back: NDArray[np.float32], stride: int) -> _Points:
+def _followed(a: _Photo, b: _Photo, there: Float32s, back: Float32s, stride: int) -> _Points:
     """The pixels of ``a``, every ``stride``-th, that the flow leads to ``b`` and back again, triangulated."""
     height, width = a.grey.shape
     places = np.mgrid[:height, :width][::-1].astype(np.float32)

@@ -21,6 +21,7 @@ from nsvq_lightning.data import PANORAMA
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap
 from nsvq_lightning.data.edges import Edges, edges_of
 from nsvq_lightning.data.pinhole import Pinhole
+from nsvq_lightning.splats.conventions import Bools, Float32s, Uint8s
 
 
 def _undecodable(path: Path, reason: str) -> SceneError:
@@ -65,7 +66,7 @@ def image_head(path: Path) -> ImageHead:
     return ImageHead((width, height), orientation, has_alpha)
 
 
-def read_image(path: Path) -> NDArray[np.uint8]:
+def read_image(path: Path) -> Uint8s:
     """Decode an image to RGB ``[H, W, 3]`` uint8: grey is repeated, alpha dropped, 16 bit scaled to 8.
 
     Raises:
@@ -108,7 +109,7 @@ def _decoded(path: Path, flags: int) -> NDArray[Any]:
     return _turned_back(image, applied)
 
 
-def _to_bytes(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+def _to_bytes(pixels: NDArray[Any]) -> Uint8s:
     """Pixels of 8 or 16 bits in 8."""
     if pixels.dtype == np.uint8:
         return pixels
@@ -147,7 +148,7 @@ def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
     return difference < max(ROUNDED * one[1] * other[0], *other)
 
 
-def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
+def read_mask(path: Path, width: int, height: int) -> Bools:
     """Which pixels of a photo count ``[height, width]``: those that are more than half as bright as the brightest.
 
     So white and 1 are kept, in 8 or 16 bits, black is excluded. Where pixels are transparent, that is the mask; in
@@ -177,7 +178,7 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     return np.asarray(cv2.resize(kept, (width, height), interpolation=cv2.INTER_NEAREST), bool)
 
 
-def resized_mask(kept: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+def resized_mask(kept: Bools, size: tuple[int, int]) -> Bools:
     """Which pixels count of a picture made ``size`` (width, height): those all of whose sources do."""
     return np.asarray(cv2.resize(kept.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255, bool)
 
@@ -261,7 +262,7 @@ class ImageSource:
             )
         return Picture(torch.from_numpy(image * kept[..., None]), torch.from_numpy(kept))
 
-    def _decode(self) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    def _decode(self) -> tuple[Uint8s, Bools | None]:
         """The file's pixels, turned, and which of them are not transparent."""
         undo = {6: 8, 8: 6}.get(self.orientation, self.orientation)  # the others undo themselves
         if not self.has_alpha:
@@ -354,7 +355,7 @@ log = logging.getLogger(__name__)
 
 # Source column and row of each pixel, ``[H, W]``, in OpenCV's pixels (centres at integers), and which pixels the camera
 # never saw.
-Maps = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]
+Maps = tuple[Float32s, Float32s, Bools]
 
 
 class Undistortion:
@@ -392,9 +393,7 @@ class Undistortion:
         self._maps: Maps | None = None
         self._warned = False
 
-    def __call__(
-        self, image: NDArray[np.uint8], kept: NDArray[np.bool_] | None = None
-    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    def __call__(self, image: Uint8s, kept: Bools | None = None) -> tuple[Uint8s, Bools | None]:
         """Undistort an image ``[H, W, 3]`` of the file's size, and say which pixels of the result count.
 
         Args:
@@ -406,7 +405,7 @@ class Undistortion:
         """
         columns, rows, blank = self.maps()
         # replicate the border, so that the cubic kernel does not mix black into the edge of the crop
-        result: NDArray[np.uint8] = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        result: Uint8s = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         count = None
         if kept is not None:
             whole = kept.astype(np.uint8) * np.uint8(255)
@@ -422,7 +421,7 @@ class Undistortion:
             return self._maps
         pixels = self._source_pixels()
         # more than a pixel outside, or NaN where the ray leaves the domain of the camera model
-        blank: NDArray[np.bool_] = np.any((pixels <= -1) | (pixels >= self._size) | np.isnan(pixels), axis=-1)
+        blank: Bools = np.any((pixels <= -1) | (pixels >= self._size) | np.isnan(pixels), axis=-1)
         columns, rows = (np.nan_to_num(pixels[..., i], nan=-1.0) for i in (0, 1))
         if blank.any() and not self._warned:
             self._warned = True
@@ -434,7 +433,7 @@ class Undistortion:
             self._maps = columns, rows, blank
         return columns, rows, blank
 
-    def _source_pixels(self) -> NDArray[np.float32]:
+    def _source_pixels(self) -> Float32s:
         """Where each pixel of the pinhole image comes from ``[H, W, 2]``."""
         K, width, height = self.pinhole.K, self.pinhole.width, self.pinhole.height
         x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+
+from nsvq_lightning.splats.conventions import Float64s
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,7 +19,7 @@ class Pinhole:
         camera_id: Number of the camera; 0 where it has none.
     """
 
-    K: NDArray[np.float64]
+    K: Float64s
     width: int
     height: int
     camera_id: int = 0
@@ -30,7 +31,7 @@ class Pinhole:
         *focal, cx, cy = params
         return cls(np.array([[focal[0], 0, cx], [0, focal[-1], cy], [0, 0, 1]], np.float64), width, height, camera_id)
 
-    def calibration_matrix(self) -> NDArray[np.float64]:
+    def calibration_matrix(self) -> Float64s:
         """``K``."""
         return self.K
 

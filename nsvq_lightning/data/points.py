@@ -4,15 +4,14 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nsvq_lightning.data.colmap import SceneError, rgb_bytes
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.ply import PlyHeader, read_ply_columns, read_ply_header
-from nsvq_lightning.splats.conventions import SH_C0
+from nsvq_lightning.splats.conventions import SH_C0, Float64s, Uint8s
 
 
-def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def read_points(path: Path) -> tuple[Float64s, Uint8s]:
     """Positions ``[P, 3]`` and RGB colours ``[P, 3]`` of a ``.ply`` point cloud; points without a colour are grey.
 
     Raises:

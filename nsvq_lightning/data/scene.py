@@ -10,7 +10,6 @@ from typing import Literal, get_args
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 from tqdm import tqdm
@@ -32,6 +31,7 @@ from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder
 from nsvq_lightning.data.transforms import random_points, read_poses
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.frame import EXTENT, Frame
+from nsvq_lightning.splats.conventions import Bools, Float64s
 
 log = logging.getLogger(__name__)
 
@@ -316,7 +316,7 @@ def usable(scene: Scene) -> Scene:
     return replace(scene, train=train, test=test)
 
 
-def _centres(model: ColmapModel) -> NDArray[np.float64]:
+def _centres(model: ColmapModel) -> Float64s:
     """Centres of the cameras ``[V, 3]``."""
     return np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in model.images])
 
@@ -339,7 +339,7 @@ def _framed(model: ColmapModel, root: Path) -> tuple[ColmapModel, Frame]:
     return replace(model, images=images, points=model.points - frame.middle), Frame(frame.unit, origin=frame.middle)
 
 
-def _astray(places: NDArray[np.float64], kind: str) -> NDArray[np.bool_]:
+def _astray(places: Float64s, kind: str) -> Bools:
     """Which places ``[P, 3]`` are much farther from the middle than the others; none of those that are not finite."""
     finite = places[np.isfinite(places).all(1)]
     if not len(finite):
@@ -363,7 +363,7 @@ def _camera(image: ColmapImage, source: ImageSource, frame: Frame) -> Camera:
 _AT_CAMERA = 1e-6
 
 
-def _away_from(centres: NDArray[np.float64], points: NDArray[np.float64], radius: float) -> NDArray[np.bool_]:
+def _away_from(centres: Float64s, points: Float64s, radius: float) -> Bools:
     """Which points ``[P, 3]`` are more than ``radius`` from all ``centres [V, 3]``, or not finite.
 
     At a camera's centre a point has no direction; splats there are in no view, or cover that camera's whole view.

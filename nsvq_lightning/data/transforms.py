@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from nsvq_lightning.data import PANORAMA, colmap
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, check_name
@@ -23,6 +22,7 @@ from nsvq_lightning.data.points import cloud_in, read_points
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.poses import looked_at, poses
+from nsvq_lightning.splats.conventions import Float64s, Int64s, Uint8s
 
 log = logging.getLogger(__name__)
 
@@ -169,7 +169,7 @@ class _Frame:
             return focal
         raise self.error("has no focal length: neither fl_x nor camera_angle_x")
 
-    def viewmat(self) -> NDArray[np.float64]:
+    def viewmat(self) -> Float64s:
         """World to camera ``[4, 4]``, x right, y down, z forward; the file has the inverse, y up, z backward.
 
         Raises:
@@ -280,7 +280,7 @@ def _plain(path: str) -> str:
 
 def _points(
     root: Path, head: dict[str, Any], images: tuple[ColmapImage, ...], cameras: dict[int, Any], allow_outside: bool
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+) -> tuple[Float64s, Uint8s]:
     """The points that a file names, or that lie beside it, in the frame of its cameras; none if there are none.
 
     Programs that wrote ``applied_transform`` have applied it to the cameras, and most of them to the points; where it
@@ -313,7 +313,7 @@ def _points(
     return points, colors
 
 
-def share_seen(points: NDArray[np.float64], cameras: list[Camera]) -> float:
+def share_seen(points: Float64s, cameras: list[Camera]) -> float:
     """Mean share of the cameras that have a point in their picture, walls disregarded."""
     return float(_sightings(points, cameras).mean() / len(cameras)) if len(points) else 0.0
 
@@ -322,7 +322,7 @@ def share_seen(points: NDArray[np.float64], cameras: list[Camera]) -> float:
 RANDOM_POINTS = 20_000
 
 
-def random_points(cameras: list[Camera]) -> NDArray[np.float64]:
+def random_points(cameras: list[Camera]) -> Float64s:
     """:data:`RANDOM_POINTS` points ``[P, 3]`` in the volume that the cameras see together, always the same ones.
 
     Candidates are spread over the views, up to twice as far away as what the cameras look at, which is where their
@@ -350,7 +350,7 @@ def random_points(cameras: list[Camera]) -> NDArray[np.float64]:
     return np.asarray(points[order[:RANDOM_POINTS]])
 
 
-def _sightings(points: NDArray[np.float64], cameras: list[Camera]) -> NDArray[np.int64]:
+def _sightings(points: Float64s, cameras: list[Camera]) -> Int64s:
     """Number of cameras ``[P]`` that have each point in their picture."""
     seen = np.zeros(len(points), np.int64)
     for camera in cameras:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.splats import attributes as splat
-from nsvq_lightning.splats.conventions import Float32s, Float64s, shN_degree, turned
+from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, shN_degree, turned
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.frame import Frame
@@ -143,7 +143,7 @@ class CompressedScene:
             *(torch.from_numpy(np.ascontiguousarray(self.values(name))) for name in splat.ATTRIBUTES)
         )
 
-    def take(self, splats: NDArray[np.integer] | NDArray[np.bool_]) -> "CompressedScene":
+    def take(self, splats: NDArray[np.integer] | Bools) -> "CompressedScene":
         """The scene of some of the splats, by index or by mask ``[N]``; codebooks stay as they are."""
         return replace(
             self,
@@ -163,7 +163,7 @@ class CompressedScene:
             codebooks={name: self.codebooks[name][used if len(used) else [0]] for name, (used, _) in rows.items()},
         )
 
-    def finite_rows(self) -> tuple[NDArray[np.bool_], dict[str, int]]:
+    def finite_rows(self) -> tuple[Bools, dict[str, int]]:
         """Which splats ``[N]`` have neither NaN nor infinite values, and how many do, by attribute."""
         bad = {name: np.where(np.isfinite(rows).all(1), 0, np.nan) for name, rows in self.codebooks.items()}
         flags = {name: flags.astype(np.float32)[self.codes[name]] for name, flags in bad.items()}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import INT64, UINT64, check_array, outside
 from nsvq_lightning.io.numbers import power_above, power_below
-from nsvq_lightning.splats.conventions import Float32s, Float64s, Int32s, Int64s, Uint64s
+from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int32s, Int64s, Uint64s
 
 # Bits per coordinate: three coordinates make a key of 63 bits.
 AXIS_BITS = 21
@@ -48,7 +48,7 @@ class Grid:
         first = np.rint(((low + high) / 2 / step - 2 * quarter) / quarter)
         return cls(step, tuple(int(cell) * quarter for cell in first))  # type: ignore[arg-type]
 
-    def cells(self, means: Float32s) -> tuple[Int64s, NDArray[np.bool_]]:
+    def cells(self, means: Float32s) -> tuple[Int64s, Bools]:
         """Cell of each position ``[N, 3]``, 0 for those outside; and which ``[N]`` are inside."""
         cells = np.floor(means.astype(np.float64) / self.step) - np.array(self.base, np.float64)
         inside = np.logical_and.reduce((cells >= 0) & (cells < 1 << AXIS_BITS), axis=1)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath
-from nsvq_lightning.splats.conventions import Float32s, Float64s, Int32s, Uint8s
+from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int32s, Uint8s
 
 
 def opacity_of(logits: Float32s) -> Float64s:
@@ -84,7 +84,7 @@ class Clamped:
         self._count(name, (values < low) | (values > high))
         return np.clip(values, low, high)
 
-    def _count(self, name: str, beyond: NDArray[np.bool_]) -> None:
+    def _count(self, name: str, beyond: Bools) -> None:
         rows = beyond.any(tuple(range(1, beyond.ndim)))
         self._counts[name] = self._counts.get(name, 0) + int(rows.sum())
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import RotationSpline
 from torch import Tensor
@@ -16,6 +15,7 @@ from torch import Tensor
 from nsvq_lightning.rendering.camera import Camera, camera_of
 from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.rendering.poses import looked_at, poses, up_of, view_from, view_towards
+from nsvq_lightning.splats.conventions import Float64s
 
 
 def reframed(camera: Camera, width: int, height: int) -> Camera:
@@ -191,7 +191,7 @@ def read_cameras(path: Path) -> dict[str, Camera]:
 _FAR = 1e30
 
 
-def _rigid_view(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:
+def _rigid_view(rotation: Float64s, position: Float64s) -> Tensor:
     """:func:`~nsvq_lightning.rendering.poses.view_from` of numbers that may be anything."""
     rigid = rotation.shape == (3, 3) and position.shape == (3,) and (np.abs(position) < _FAR).all()
     if not rigid or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
@@ -199,7 +199,7 @@ def _rigid_view(rotation: NDArray[np.float64], position: NDArray[np.float64]) ->
     return view_from(rotation, position)
 
 
-def _arc(angles: NDArray[np.float64]) -> tuple[float, float]:
+def _arc(angles: Float64s) -> tuple[float, float]:
     """Start and length of the arc that angles fill: the circle without their largest gap."""
     ordered = np.sort(angles)
     gaps = np.diff(np.concatenate([ordered, ordered[:1] + 2 * math.pi]))

@@ -10,13 +10,11 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
+from nsvq_lightning.splats.conventions import Float64s
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
-
-Floats = NDArray[np.float64]
 
 # Extent of the cameras in a frame.
 EXTENT = 5.0
@@ -42,7 +40,7 @@ class Frame:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @classmethod
-    def around(cls, centres: Floats) -> "Frame":
+    def around(cls, centres: Float64s) -> "Frame":
         """The frame of cameras: 0 is the median of their centres ``[V, 3]``, and their extent is :data:`EXTENT`.
 
         The extent is 1.1 × the largest distance from the middle, without cameras that are :data:`REACH` times as far
@@ -58,7 +56,7 @@ class Frame:
         """Distance of the near plane in the files."""
         return NEAR * self.unit
 
-    def points(self, points: Floats) -> Floats:
+    def points(self, points: Float64s) -> Float64s:
         """Points ``[P, 3]`` of the files, here; rounded."""
         return np.asarray(np.rint((points - self.middle) / self.unit * STEPS) / STEPS)
 
@@ -91,7 +89,7 @@ class Frame:
 _cameras: WeakKeyDictionary[Camera, dict[Frame, Camera]] = WeakKeyDictionary()
 
 
-def reach_of(distances: Floats) -> float:
+def reach_of(distances: Float64s) -> float:
     """The largest of distances ``[V]`` that is at most :data:`REACH` times what four fifths of them do not exceed."""
     usual = float(np.quantile(distances, 0.8, method="lower"))
     return float(distances[distances <= REACH * usual].max() if usual > 0 else distances.max())

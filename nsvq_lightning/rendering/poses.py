@@ -4,23 +4,23 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.splats.conventions import Float64s
 
 # Weight of what decides where cameras that all look the same way leave a direction open.
 LITTLE = 1e-5
 
 
-def poses(cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], Rotation]:
+def poses(cameras: Sequence[Camera]) -> tuple[Float64s, Rotation]:
     """Positions ``[N, 3]``, and rotations from camera to world."""
     packed = np.array([camera.packed_view for camera in cameras])
     return packed[:, 12:], Rotation.from_matrix(packed[:, :9].reshape(-1, 3, 3).transpose(0, 2, 1))
 
 
-def looked_at(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+def looked_at(cameras: Sequence[Camera]) -> Float64s:
     """The point ``[3]`` nearest to all lines of sight; where they are parallel, one in front of the cameras."""
     positions, rotations = poses(cameras)
     forward = rotations.as_matrix()[:, :, 2]
@@ -32,7 +32,7 @@ def looked_at(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     return np.linalg.solve(total, np.einsum("nij,nj->i", across, positions) + weight * ahead)
 
 
-def up_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+def up_of(cameras: Sequence[Camera]) -> Float64s:
     """The direction ``[3]`` that is up for cameras most of which are held level, unit length.
 
     It is at right angles to where their right is, the sum of the sines of their rolls being least, so that a minority
@@ -52,7 +52,7 @@ def up_of(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     return up
 
 
-def view_towards(target: NDArray[np.float64], eye: NDArray[np.float64], up: NDArray[np.float64]) -> Tensor:
+def view_towards(target: Float64s, eye: Float64s, up: Float64s) -> Tensor:
     """World to camera ``[4, 4]`` float32: from ``eye [3]`` a camera looks at ``target [3]``, with ``up [3]`` above."""
     forward = (target - eye) / (np.linalg.norm(target - eye) or 1.0)
     right = np.cross(forward, up)
@@ -60,7 +60,7 @@ def view_towards(target: NDArray[np.float64], eye: NDArray[np.float64], up: NDAr
     return view_from(np.stack([right, np.cross(forward, right), forward], axis=1), eye)
 
 
-def view_from(rotation: NDArray[np.float64], position: NDArray[np.float64]) -> Tensor:
+def view_from(rotation: Float64s, position: Float64s) -> Tensor:
     """World to camera ``[4, 4]`` float32, from the rotation to the world and the position in it."""
     view = np.eye(4)
     view[:3, :3] = rotation.T

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # NumPy arrays of any shape, by the type of their numbers.
+Bools = NDArray[np.bool_]
 Float32s = NDArray[np.float32]
 Float64s = NDArray[np.float64]
 Int32s = NDArray[np.int32]

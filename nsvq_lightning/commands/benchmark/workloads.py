@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.commands.benchmark import SIZES, Scope
@@ -13,6 +12,7 @@ from nsvq_lightning.compression.viewpoints import look_at, middle_of
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.splats.conventions import Float64s
 from nsvq_lightning.splats.splats import RawSplats, Splats, detached
 
 
@@ -114,20 +114,17 @@ def synthetic_workload(name: str) -> Workload:
     return _seen_by(_camera(width, height, np.zeros(3), 4.0), RawSplats(*map(_tensor, attributes)), name)
 
 
-Floats = NDArray[np.float64]
-
-
-def _tensor(values: Floats) -> Tensor:
+def _tensor(values: Float64s) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, np.float32))
 
 
-def _directions(rng: np.random.Generator, count: int, dim: int) -> Floats:
+def _directions(rng: np.random.Generator, count: int, dim: int) -> Float64s:
     """Uniform unit vectors ``[count, dim]``."""
     vectors = rng.normal(size=(count, dim))
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
-def _positions(count: int, rng: np.random.Generator) -> Floats:
+def _positions(count: int, rng: np.random.Generator) -> Float64s:
     """Positions ``[count, 3]``, shuffled: a sphere, the ground, a box, a loose cloud, a shell of background."""
     on_sphere, on_ground, on_box, in_cloud = parts = [int(share * count) for share in (0.25, 0.25, 0.10, 0.25)]
     sphere = _directions(rng, on_sphere, 3) * 0.9 + rng.normal(size=(on_sphere, 3)) * 0.02
@@ -144,7 +141,7 @@ def _positions(count: int, rng: np.random.Generator) -> Floats:
     return positions[rng.permutation(count)]
 
 
-def _camera(width: int, height: int, target: Floats, distance: float) -> Camera:
+def _camera(width: int, height: int, target: Float64s, distance: float) -> Camera:
     """A camera that looks at ``target`` from above and aside, y down."""
     azimuth, elevation = 0.5, 0.35
     across = math.cos(elevation)

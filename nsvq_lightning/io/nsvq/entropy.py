@@ -8,13 +8,12 @@ from functools import partial
 
 import numpy as np
 from numba import uint64
-from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array, outside
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.nsvq import range_coder as rc
-from nsvq_lightning.splats.conventions import Int32s, Int64s, Uint32s, Uint64s
+from nsvq_lightning.splats.conventions import Bools, Int32s, Int64s, Uint32s, Uint64s
 
 # Bits of a key; the highest is bit 62.
 KEY_BITS = 63
@@ -133,7 +132,7 @@ def encode_integers(values: Int64s) -> bytes:
     if values.ndim != 2 or (values.size and max(-int(values.min()), int(values.max())) >= _TOO_LARGE):
         raise ValueError(f"values must have shape [N, D] and be below 2^52 in size, got {list(values.shape)}")
     steps = np.diff(values, axis=0, prepend=0)
-    by_steps: NDArray[np.bool_] = _bit_lengths(steps).sum(0) < _bit_lengths(values).sum(0)  # approximately their bits
+    by_steps: Bools = _bit_lengths(steps).sum(0) < _bit_lengths(values).sum(0)  # approximately their bits
     chosen = np.where(by_steps, steps, values)
     words = _room(int(_bit_lengths(chosen).sum()) + 8 * chosen.size)
     used = _write_integers(chosen, words, rc.new_contexts(_INTEGER_CONTEXTS * values.shape[1]))
