@@ -26,7 +26,6 @@ from nsvq_lightning import callbacks, quantize
 from nsvq_lightning.callbacks.standard import OPTIONAL, STANDARD
 from nsvq_lightning.commands import arguments as given
 from nsvq_lightning.commands.registry import COMMANDS
-from nsvq_lightning.compute.upstream import check_replaced
 from nsvq_lightning.data.colmap import check_name
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.io.atomic import optional, write_text
@@ -35,6 +34,7 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import check_settings, read_checkpoint
 from nsvq_lightning.training.run_folder import is_fast_dev_run, reserve, run_folder
 from nsvq_lightning.training.trainer import TRAINER_DEFAULTS, SplatTrainer
+from nsvq_lightning.version import check_replaced
 
 
 class QuietParser(LightningArgumentParser):

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.distributed import all_reduce
 
 from nsvq_lightning.compute.devices import to_device
-from nsvq_lightning.compute.upstream import check_replaced
+from nsvq_lightning.version import check_replaced
 
 T = TypeVar("T")
 

@@ -10,7 +10,7 @@ import pytest
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.strategies import DDPStrategy
 
-from nsvq_lightning.compute.upstream import check_replaced
+from nsvq_lightning.version import check_replaced
 
 
 @pytest.mark.parametrize(
