@@ -30,7 +30,9 @@ def check_pair(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Non
 
 def in_range(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """Two pictures as floats: the rendered one clamped to [0, 1], the other scaled to [0, 1] if it is uint8."""
-    return image.clamp(0.0, 1.0), target.to(image.dtype) / 255 if target.dtype == torch.uint8 else target
+    # Not the gradient of clamp, which at 0 and 1 themselves is 1 before torch 2.14 and 0 from there on.
+    inside = torch.where((image < 0) | (image > 1), image.detach().clamp(0.0, 1.0), image)
+    return inside, target.to(image.dtype) / 255 if target.dtype == torch.uint8 else target
 
 
 def plain_ssim(image: Tensor, target: Tensor) -> Tensor:
