@@ -125,10 +125,7 @@ def expand(arguments: Sequence[str]) -> list[str]:
             expanded.append(f"{BUDGET}.{name}={value}")
             expanded += [f"{BUDGET}.{other}=null" for other in ("splats", "bytes") if other != name]
     # An option holds whatever a config says, also one that stands after it.
-    words = [each for each in expanded if not each.startswith("--")]
-    configs = [each for each in expanded if each.startswith(CONFIG)]
-    options = [each for each in expanded if each.startswith("--") and each not in configs]
-    return [*words, *configs, *options]
+    return sorted(expanded, key=lambda each: (each.startswith("--"), not each.startswith(CONFIG)))
 
 
 # Types as users call them; others by their name.
@@ -387,13 +384,8 @@ def photos_of(path: Path) -> Path | None:
         ValueError: Beside it is a ``config.yaml`` that is no table of settings.
     """
     config = (path if path.is_dir() else path.parent) / "config.yaml"
-    if not config.is_file():
-        return None
-    data = check_config(str(config)).get("data")
-    data = data.get("init_args", data) if isinstance(data, dict) else None
-    root = data.get("root") if isinstance(data, dict) else None
-    folder = Path(root).expanduser() if isinstance(root, str) else None
-    return folder if folder is not None and folder.is_dir() else None
+    root = _values_by_name(settings_of([str(config)])).get("data.root")
+    return Path(root).expanduser() if root and Path(root).expanduser().is_dir() else None
 
 
 def cameras_of(path: Path, root: Path | None) -> "dict[str, Camera]":

@@ -50,26 +50,26 @@ class PointTable(NamedTuple):
     tracks: Sequence[Sequence[int]]
 
 
-# Camera models by COLMAP's number: their name, and how many parameters they have.
+# Camera models in the order of COLMAP's numbers, and how many parameters each has.
 LENSES = {
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8),
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
-    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-    12: ("SIMPLE_DIVISION", 4),
-    13: ("DIVISION", 5),
-    14: ("SIMPLE_FISHEYE", 3),
-    15: ("FISHEYE", 4),
-    16: ("EUCM", 6),
-    17: ("EQUIRECTANGULAR", 2),
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4,
+    "DIVISION": 5,
+    "SIMPLE_FISHEYE": 3,
+    "FISHEYE": 4,
+    "EUCM": 6,
+    "EQUIRECTANGULAR": 2,
 }
 
 
@@ -171,11 +171,11 @@ def _records(path: Path, record: Callable[[mmap.mmap, int], tuple[_Row, int]]) -
 
 def _camera_record(data: mmap.mmap, start: int) -> tuple[CameraRow, int]:
     number, model, width, height = _CAMERA.unpack_from(data, start)
-    if model not in LENSES:
+    if not 0 <= model < len(LENSES):
         raise struct.error(
-            f"camera {number} has model id {model} and size {width}x{height}; known are the ids 0 to {max(LENSES)}"
+            f"camera {number} has model id {model} and size {width}x{height}; known are the ids 0 to {len(LENSES) - 1}"
         )
-    name, count = LENSES[model]
+    name, count = list(LENSES.items())[model]
     params = struct.unpack_from(f"<{count}d", data, start + _CAMERA.size)
     return CameraRow(number, name, width, height, params), start + _CAMERA.size + 8 * count
 
@@ -236,12 +236,12 @@ def _camera_line(line: int, words: Sequence[str]) -> CameraRow:
     if len(words) < 4:
         raise ValueError(f"line {line} has {len(words)} words; a camera has identifier, model, width, height, numbers")
     number, width, height, *params = _numbers(line, [words[0], *words[2:]])
-    model, counts = words[1].upper(), dict(LENSES.values())
-    if model not in counts:
-        raise ValueError(f"line {line}: camera {number:g} has the model {model}; known are {', '.join(counts)}")
-    if len(params) != counts[model]:
+    model = words[1].upper()
+    if model not in LENSES:
+        raise ValueError(f"line {line}: camera {number:g} has the model {model}; known are {', '.join(LENSES)}")
+    if len(params) != LENSES[model]:
         raise ValueError(
-            f"line {line}: camera {number:g} of model {model} has {len(params)} parameters in place of {counts[model]}"
+            f"line {line}: camera {number:g} of model {model} has {len(params)} parameters in place of {LENSES[model]}"
         )
     return CameraRow(int(number), model, int(width), int(height), tuple(params))
 

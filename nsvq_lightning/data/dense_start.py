@@ -1,8 +1,7 @@
 """Points where the photos have detail, from the optical flow between neighbouring train photos."""
 
-from collections.abc import Iterable, Sized
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,8 +16,6 @@ from nsvq_lightning.data.images import resized_mask
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Uint8s
-
-T = TypeVar("T")
 
 
 class _Photo(NamedTuple):
@@ -86,14 +83,14 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     cv2.setNumThreads(1)  # with several, DIS works in stripes, and its bits depend on how many
     try:
         with ThreadPoolExecutor(usable_cores()) as pool:
-            photos = list(
-                _shown("photos", pool.map(lambda index: _photo(scene, index, known), scene.train), scene.train)
-            )
+            looked = pool.map(lambda index: _photo(scene, index, known), scene.train)
+            photos = list(tqdm(looked, "dense start: photos", len(scene.train), leave=False, disable=None))
             pairs = _neighbours(photos)
             pixels = 2 * len(pairs) * photos[0].grey.size
             stride = max(2, int(np.ceil(np.sqrt(pixels / MOST_CANDIDATES))))
-            flows = _shown("flows", pool.map(lambda pair: _triangulated(pair, stride), pairs), pairs)
-            found = [each for two in flows for each in two]
+            flows = pool.map(lambda pair: _triangulated(pair, stride), pairs)
+            bar = tqdm(flows, "dense start: flows", len(pairs), leave=False, disable=None)
+            found = [each for two in bar for each in two]
     finally:
         cv2.setNumThreads(threads)
     if not found:
@@ -114,12 +111,6 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     del positions, colors, detail, cells, cell, crowd, weight
     trim()
     return chosen
-
-
-def _shown(what: str, results: Iterable[T], of: Sized) -> Iterable[T]:
-    """The results, with a bar on a terminal."""
-    bar: Iterable[T] = tqdm(results, f"dense start: {what}", len(of), leave=False, disable=None)
-    return bar
 
 
 # Photos are looked at with at most so many pixels on their longer side.

@@ -316,8 +316,6 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
 
 def placed(scene: CompressedScene, frame: "Frame") -> CompressedScene:
     """The scene in the coordinates of its files, from those of the frame that it was trained in."""
-    if frame.unit == 1 and not any(frame.middle):
-        return replace(scene, origin=frame.origin)
 
     def rows(tables: Mapping[str, Float32s]) -> dict[str, Float32s]:
         longer = np.log(frame.unit)

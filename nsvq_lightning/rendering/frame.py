@@ -78,8 +78,6 @@ class Frame:
     def splats(self, splats: SplatTensors) -> RawSplats:
         """Splats of the files, here; detached."""
         raw = detached(splats)
-        if self == Frame():
-            return raw
         middle = torch.tensor(self.middle, dtype=torch.float64, device=raw.means.device)
         means = ((raw.means.double() - middle) / self.unit).to(raw.means)
         return raw._replace(means=means, scales=(raw.scales.double() - math.log(self.unit)).to(raw.scales))

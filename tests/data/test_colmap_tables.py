@@ -92,4 +92,5 @@ def test_the_camera_models_are_those_of_colmap() -> None:
     pycolmap = import_pycolmap()
     known = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
     make = pycolmap.Camera.create_from_model_id
-    assert {int(m.value): (name, len(make(1, m, 1.0, 1, 1).params)) for name, m in known.items()} == LENSES
+    counts = {int(m.value): (name, len(make(1, m, 1.0, 1, 1).params)) for name, m in known.items()}
+    assert counts == dict(enumerate(LENSES.items()))

@@ -113,7 +113,7 @@ def test_a_dense_start_adds_points_to_those_of_sfm(
 
     with caplog.at_level(logging.INFO):
         known, more = splats(0.0), splats(0.8)
-    (line,) = [message for message in caplog.messages if message.startswith("dense start: ")]
+    (line,) = [message for message in caplog.messages if "points beside" in message]
     assert line.startswith(f"dense start: {8000 - known} points beside {known} of SfM, ")
     assert more == 8000
 
