@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -117,6 +118,7 @@ def test_one_callback_says_what_it_takes(capsys: pytest.CaptureFixture[str]) -> 
     assert "--callbacks.density.grad_threshold=0.0003\n" in out
 
 
+@pytest.mark.usefixtures("help_of_here")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -186,6 +188,13 @@ def test_wrong_arguments_are_explained(
     assert message.replace("{folder}", str(tmp_path)) in capsys.readouterr().err
 
 
+@pytest.fixture
+def help_of_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take the stored help for that of the versions that are installed, whichever they are."""
+    monkeypatch.setattr(given, "FIT_HELP_OF", {name: version(name) for name in given.FIT_HELP_OF})
+
+
+@pytest.mark.usefixtures("help_of_here")
 @pytest.mark.parametrize("name", ["lightning", "jsonargparse"])
 def test_options_of_another_lightning_are_left_to_its_parser(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str

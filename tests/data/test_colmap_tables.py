@@ -93,4 +93,4 @@ def test_the_camera_models_are_those_of_colmap() -> None:
     known = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
     make = pycolmap.Camera.create_from_model_id
     counts = {int(m.value): (name, len(make(1, m, 1.0, 1, 1).params)) for name, m in known.items()}
-    assert counts == dict(enumerate(LENSES.items()))
+    assert counts.items() <= dict(enumerate(LENSES.items())).items()  # older ones know fewer

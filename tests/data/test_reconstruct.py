@@ -266,7 +266,7 @@ def _photo(path: Path, seed: int = 0, focal: float | None = None, model: str = "
     exif = PIL.Image.Exif()
     if focal is not None:
         exif[0x0110] = model
-        exif.get_ifd(0x8769)[0x920A] = focal
+        exif[0x8769] = {0x920A: focal}
     noise = np.random.default_rng(seed).integers(0, 255, (48, 64, 3), dtype=np.uint8)
     path.parent.mkdir(parents=True, exist_ok=True)
     PIL.Image.fromarray(noise).resize((128, 96)).save(path, exif=exif)

@@ -11,10 +11,10 @@ from unittest.mock import ANY
 import numpy as np
 import pytest
 import torch
+from checkpoints import assert_same_end, read
 from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import RECIPE_MODULE, Recipe, RunFactory, Whole, Witness, paper_phases, paper_replacement, recipe_options
 
-from checkpoints import assert_same_end, read
 from nsvq_lightning.callbacks import (
     CanonicalCovariance,
     CodebookInit,

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from checkpoints import read
 from moved_scenes import write_moved
 
-from checkpoints import read
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import read_scene
