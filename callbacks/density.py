@@ -258,12 +258,13 @@ class DensityControl(Densification):
         """Clone, split, prune and reset when due."""
         schedule = module.schedule
         growing = schedule.phase_at(iteration) is Phase.WARMUP
-        if self.is_due(module, iteration) and growing:
+        due = self.is_due(module, iteration)
+        if due and growing:
             added = self._grow(trainer, module, iteration)
             pruned = self._prune(trainer, module, huge=iteration > schedule.iteration(self.huge_after))
             distributed.check_replicas(trainer, "density control")
             log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
-        elif self.is_due(module, iteration):
+        elif due:
             pruned = self._prune(trainer, module, huge=False)
             distributed.check_replicas(trainer, "pruning")
             level = logging.INFO if pruned else logging.DEBUG
