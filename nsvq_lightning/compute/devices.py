@@ -47,7 +47,7 @@ def best_device() -> torch.device:
 
 def devices_with_kernels() -> list[str]:
     """Types of device that have kernels here: ``cpu`` and, where it is the best one, ``cuda``."""
-    return list(dict.fromkeys(("cpu", best_device().type)))
+    return sorted({"cpu", best_device().type})
 
 
 def check_can_train(device: torch.device, backend: str) -> None:

@@ -47,8 +47,7 @@ class SplatTrainer(Trainer):
     def __init__(
         self, *args: Any, run_folder: str | None = None, allow_other_scene: bool = False, **kwargs: Any
     ) -> None:
-        for name, value in (TRAINER_DEFAULTS | {"logger": False}).items():
-            kwargs.setdefault(name, value)
+        kwargs = TRAINER_DEFAULTS | {"logger": False} | kwargs
         if kwargs.get("accelerator", "auto") == "auto":
             kwargs["accelerator"] = best_device().type
         several = "view_parallel_notebook" if hasattr(sys, "ps1") else "view_parallel"
