@@ -305,16 +305,16 @@ def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
 def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     """Decode all photos, in parallel: whether that works, how much masks exclude, and which are not in the model."""
     from nsvq_lightning.data.reconstruct import PHOTOS
-    from nsvq_lightning.data.scene import unusable
+    from nsvq_lightning.data.scene import each_photo
 
-    count, broken = len(scene), unusable(scene)
+    masks = each_photo(scene, lambda picture: 1.0 if picture.mask is None else float(picture.mask.float().mean()))
+    count, broken = len(scene), [found for found in masks if not isinstance(found, float)]
     if broken:
-        first = next(iter(broken.values()))
-        yield Finding("problem", "photos", f"{len(broken)} of {count} cannot be used; first: {first}")
+        yield Finding("problem", "photos", f"{len(broken)} of {count} cannot be used; first: {broken[0]}")
     else:
         yield judged("photos", f"all {count} registered photos can be read")
-    masks = {scene.names[index]: scene.images[index].mask for index in range(count) if index not in broken}
-    masked = {name: float(mask.float().mean()) for name, mask in masks.items() if mask is not None}
+    shares = zip(scene.names, masks, strict=True)
+    masked = {name: found for name, found in shares if isinstance(found, float) and found < 1}
     if masked:
         share = 1 - sum(masked.values()) / len(masked)
         text = f"{len(masked)} of {count} photos have pixels that do not count, {100 * share:.0f} % of them"

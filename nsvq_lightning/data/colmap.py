@@ -53,6 +53,11 @@ class ColmapImage:
     viewmat: Float64s
     mask: Path | None = None
 
+    @property
+    def centre(self) -> Float64s:
+        """Where the camera is ``[3]``, scene units."""
+        return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
+
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:
@@ -335,10 +340,7 @@ def alignment(model: ColmapModel, other: ColmapModel) -> Float64s:
     Raises:
         SceneError: They share fewer than three photos, or these lie on a line, and so do not say how it turns.
     """
-    centres = [
-        {image.name: -image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in found.images}
-        for found in (model, other)
-    ]
+    centres = [{image.name: image.centre for image in found.images} for found in (model, other)]
     shared = sorted(centres[0].keys() & centres[1].keys())
     ours, theirs = (np.array([places[name] for name in shared]).reshape(-1, 3) for places in centres)
     for places in (ours, theirs):

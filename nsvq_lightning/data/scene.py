@@ -1,11 +1,12 @@
 """A scene: registered views with pinhole cameras, sparse points, the split into train and test, and photos' detail."""
 
 import logging
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from nsvq_lightning.data.images import (
     ImageHead,
     ImageSource,
     ImageStore,
+    Picture,
     image_head,
     rectify,
     same_shape,
@@ -210,7 +212,7 @@ def load_scene(
         points = random_points([cameras[index] for index in train])
         log.info("%s has no points: %d random ones in what the cameras see take their place", root, len(points))
         poses = replace(poses, points=points, colors=np.full((len(points), 3), 128, np.uint8))
-    centres = _centres(poses)
+    centres = np.stack([image.centre for image in poses.images])
     extent = EXTENT * frame.unit if np.ptp(centres, axis=0).any() else 0.0
     usable = _away_from(centres, poses.points, _AT_CAMERA * extent)
     usable &= ~_astray(poses.points, "points")
@@ -279,33 +281,33 @@ def _image_sources(
     ]
 
 
-def unusable(scene: Scene) -> dict[int, SceneError]:
-    """Views of which there is no picture, and why: of damaged photos, and of wholly masked ones.
+T = TypeVar("T")
 
-    All photos are decoded, and kept as far as the memory for them lasts.
+
+def each_photo(scene: Scene, say: Callable[[Picture], T]) -> list[T | SceneError]:
+    """What there is to say of the picture of each view, or why there is none: damaged photos, and wholly masked ones.
+
+    All photos are decoded, several at a time, and kept as far as the memory for them lasts.
     """
 
-    def problem(index: int) -> SceneError | None:
+    def look(index: int) -> T | SceneError:
         try:
-            _ = scene.images[index]
+            return say(scene.images[index])
         except SceneError as error:
             return error
-        return None
 
     with ThreadPoolExecutor(usable_cores()) as pool:
-        problems = enumerate(
-            tqdm(pool.map(problem, range(len(scene))), "photos", len(scene), leave=False, disable=None)
-        )
-        return {index: error for index, error in problems if error is not None}
+        return list(tqdm(pool.map(look, range(len(scene))), "photos", len(scene), leave=False, disable=None))
 
 
 def usable(scene: Scene) -> Scene:
-    """The scene without the train and test views that are :func:`unusable`; warns of them.
+    """The scene without the train and test views of which there is no picture (:func:`each_photo`); warns of them.
 
     Raises:
         SceneError: No train or no test view is left.
     """
-    wrong = unusable(scene)
+    found = enumerate(each_photo(scene, lambda _: None))
+    wrong = {index: error for index, error in found if error is not None}
     if not wrong:
         return scene
     first = next(iter(wrong.values()))
@@ -316,14 +318,9 @@ def usable(scene: Scene) -> Scene:
     return replace(scene, train=train, test=test)
 
 
-def _centres(model: ColmapModel) -> Float64s:
-    """Centres of the cameras ``[V, 3]``."""
-    return np.stack([-image.viewmat[:3, :3].T @ image.viewmat[:3, 3] for image in model.images])
-
-
 def _framed(model: ColmapModel, root: Path) -> tuple[ColmapModel, Frame]:
     """The frame of a model's cameras, and the model with an origin near them; warns of cameras that went astray."""
-    centres = _centres(model)
+    centres = np.stack([image.centre for image in model.images])
     frame = Frame.around(centres)
     lost = np.flatnonzero(_astray(centres, "cameras"))
     if len(lost):
