@@ -10,7 +10,7 @@ from nsvq_lightning.report.files import file_stem
 from nsvq_lightning.training import row_ops
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import hold, is_fast_dev_run, let_go, run_folder
-from nsvq_lightning.training.scene_module import scene_of
+from nsvq_lightning.training.run_scene import scene_of
 
 from .settings import check_settings
 
@@ -84,20 +84,22 @@ class SplatCallback(Callback):
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Call :meth:`before_step`."""
         iteration = trainer.global_step + 1
-        if self._first_time("before", iteration):
+        if first_time(self, "before", iteration):
             self.before_step(trainer, module, iteration)
 
     def on_train_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, *args: Any) -> None:
         """Call :meth:`after_step`."""
         iteration = trainer.global_step
-        if iteration and self._first_time("after", iteration):
+        if iteration and first_time(self, "after", iteration):
             self.after_step(trainer, module, iteration)
 
-    def _first_time(self, hook: str, iteration: int) -> bool:
-        if self._acted.get(hook) == iteration:
-            return False
-        vars(self)["_acted"] = self._acted | {hook: iteration}
-        return True
+
+def first_time(callback: SplatCallback, hook: str, iteration: int) -> bool:
+    """Whether a callback acts in an iteration for the first time; notes that it does."""
+    if callback._acted.get(hook) == iteration:
+        return False
+    vars(callback)["_acted"] = callback._acted | {hook: iteration}
+    return True
 
 
 class WritingCallback(SplatCallback):
@@ -117,7 +119,7 @@ class WritingCallback(SplatCallback):
         """
         super().setup(trainer, module, stage)
         if stage != "fit" and stage in self.stages:
-            self._take_folder(trainer)
+            take_folder(trainer)
 
     def on_fit_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Take the folder, now that the trainer knows which checkpoint it continues from.
@@ -125,17 +127,22 @@ class WritingCallback(SplatCallback):
         Raises:
             FileExistsError: It holds another run.
         """
-        self._take_folder(trainer)
-
-    def _take_folder(self, trainer: Trainer) -> None:
-        folder = run_folder(trainer)
-        if trainer.is_global_zero and not is_fast_dev_run(trainer):
-            hold(folder)  # again, if an earlier stage of the run has ended
+        take_folder(trainer)
 
     def teardown(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Let go of the folder: nothing is written after this."""
         if stage in self.stages:
             let_go(run_folder(trainer))
+
+
+def take_folder(trainer: Trainer) -> None:
+    """Take the folder of the run, again if an earlier stage of the run has ended.
+
+    Raises:
+        FileExistsError: It holds another run.
+    """
+    if trainer.is_global_zero and not is_fast_dev_run(trainer):
+        hold(run_folder(trainer))
 
 
 def picture_file(trainer: Trainer, folder: Path, view: str) -> Path:

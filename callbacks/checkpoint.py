@@ -18,7 +18,7 @@ from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 
-from .base import WritingCallback
+from .base import WritingCallback, first_time
 from .settings import Whole
 
 log = logging.getLogger(__name__)
@@ -162,7 +162,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     def on_train_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, *args: Any) -> None:
         """Save when it is time; stop here if a signal came."""
         iteration = trainer.global_step
-        if iteration == 0 or not self._first_time("after", iteration):
+        if iteration == 0 or not first_time(self, "after", iteration):
             return  # of the next iteration some micro-batches are done
         if iteration == trainer.max_steps:
             # The end of training may fail; it belongs to a checkpoint, too, and signals wait.

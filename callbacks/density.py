@@ -17,8 +17,8 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
-from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training import distributed, row_ops, scene_module
+from nsvq_lightning.splats.splats import RawSplats, Splats
+from nsvq_lightning.training import distributed, row_ops, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -79,7 +79,7 @@ class Densification(SplatCallback, ABC):
         if count > limit and module.phase > Phase.PRUNE:
             log.warning(f"{self.limit_name}={limit} comes too late for {count} splats with codebooks; all are kept")
         elif count > limit:
-            kept = most_contributing(scene_module.train_contributions(trainer, module), limit)
+            kept = most_contributing(run_scene.train_contributions(trainer, module.scene), limit)
             row_ops.keep_rows(module.splats, trainer.optimizers[0], kept)
             distributed.check_replicas(trainer, "the limit of splats")
             log.info("kept %d of %d splats, those that contribute most to the train views", limit, count)
@@ -92,7 +92,7 @@ class Densification(SplatCallback, ABC):
     def on_train_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, *args: Any) -> None:
         """Add the statistics of this view; after a complete step do what is due."""
         if self._counts:
-            self._observe(trainer, module, self._view(trainer, module, outputs or {}))
+            self._observe(trainer, module, outputs or {})
         super().on_train_batch_end(trainer, module, outputs, *args)
 
     def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
@@ -115,38 +115,24 @@ class Densification(SplatCallback, ABC):
         row_ops.keep_rows(module.splats, trainer.optimizers[0], ~mask)
         return count
 
-    @torch.no_grad()
-    def reset_opacities(self, trainer: Trainer, module: SplatModule, ceiling: float) -> None:
-        """Lower all opacities to at most ``ceiling``, and forget their moments."""
-        optimizer = trainer.optimizers[0]
-        lowered = module.splats.opacities.clamp(max=math.log(ceiling / (1.0 - ceiling)))
-        row_ops.replace_attribute(module.splats, optimizer, "opacities", lowered)
-        row_ops.reset_moments(optimizer, "opacities")
-        distributed.check_replicas(trainer, "the opacity reset")
-
-    def _view(self, trainer: Trainer, module: SplatModule, outputs: dict[str, Any]) -> Render | None:
-        """The step's rendering; None if there is none, its loss is not finite, or the splats have changed since."""
-        splats, render, loss = module.splats, outputs.get("render"), outputs.get("late_loss")
-        if loss is not None and not math.isfinite(loss.read()):
-            return None
-        if render is None or (len(render.radii) == len(splats) and outputs.get("edits", splats.edits) == splats.edits):
-            return render
-        if not self._warned:
-            self._warned = True
-            log.warning(
-                f"iteration {trainer.global_step}: another callback has removed or added splats ({len(render.radii)} "
-                f"were rendered, now {len(splats)}) before density control took the statistics of the view; such views "
-                f"are left out from now on. List that callback after {type(self).__name__} to count all views"
-            )
-        return None
-
-    def _observe(self, trainer: Trainer, module: SplatModule, render: Render | None) -> None:
-        """Add one view (of each process) to the statistics; None, for a view without a loss, adds nothing."""
+    def _observe(self, trainer: Trainer, module: SplatModule, outputs: dict[str, Any]) -> None:
+        """Add a view (of each process) to the statistics, unless its loss is not finite or its splats have changed."""
+        render = _counted_render(outputs)
+        if render is not None and _has_changed(module.splats, render, outputs):
+            if not self._warned:
+                self._warned = True
+                log.warning(
+                    f"iteration {trainer.global_step}: another callback has removed or added splats "
+                    f"({len(render.radii)} were rendered, now {len(module.splats)}) before density control took the "
+                    "statistics of the view; such views are left out from now on. List that callback after "
+                    f"{type(self).__name__} to count all views"
+                )
+            render = None
         tables = [module.splats.add_table(name) for name in self.tables]
-        several, own = trainer.world_size > 1, tables
-        if several:
-            own = [torch.zeros_like(table) for table in tables]
-        if render is not None and (gradients := self.gradients(render)) is not None:
+        several = trainer.world_size > 1
+        own = [torch.zeros_like(table) for table in tables] if several else tables
+        gradients = None if render is None else self.gradients(render)
+        if render is not None and gradients is not None:
             # Each micro-batch is a separate view here; the loss was divided by their number.
             height, width = (side * trainer.accumulate_grad_batches for side in render.alpha.shape)
             add_view(own, gradients, render.radii, width, height)
@@ -272,7 +258,7 @@ class DensityControl(Densification):
         on_white = module.background == "white" and self.white_reset > 0
         first = on_white and iteration == schedule.iteration(self.white_reset)
         if growing and (first or iteration in schedule.reset_times(self.reset_last, self.reset_every)):
-            self.reset_opacities(trainer, module, self.reset_opacity)
+            reset_opacities(trainer, module, self.reset_opacity)
 
     @torch.no_grad()
     def _grow(self, trainer: Trainer, module: SplatModule, iteration: int) -> int:
@@ -298,6 +284,29 @@ class DensityControl(Densification):
         if huge:
             marked |= splats.scales.amax(1).exp() > self.huge_fraction * module.extent
         return self.prune(trainer, module, marked)
+
+
+def _counted_render(outputs: dict[str, Any]) -> Render | None:
+    """The step's rendering; None if there is none, or its loss is not finite."""
+    loss = outputs.get("late_loss")
+    if loss is not None and not math.isfinite(loss.read()):
+        return None
+    return outputs.get("render")
+
+
+def _has_changed(splats: Splats, render: Render, outputs: dict[str, Any]) -> bool:
+    """Whether splats were added or removed since they were rendered."""
+    return len(render.radii) != len(splats) or outputs.get("edits", splats.edits) != splats.edits
+
+
+@torch.no_grad()
+def reset_opacities(trainer: Trainer, module: SplatModule, ceiling: float) -> None:
+    """Lower all opacities to at most ``ceiling``, and forget their moments."""
+    optimizer = trainer.optimizers[0]
+    lowered = module.splats.opacities.clamp(max=math.log(ceiling / (1.0 - ceiling)))
+    row_ops.replace_attribute(module.splats, optimizer, "opacities", lowered)
+    row_ops.reset_moments(optimizer, "opacities")
+    distributed.check_replicas(trainer, "the opacity reset")
 
 
 def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, width: int, height: int) -> None:

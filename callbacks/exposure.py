@@ -9,7 +9,7 @@ from lightning.pytorch import Trainer
 
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.rasterize import Render
-from nsvq_lightning.training import distributed, scene_module
+from nsvq_lightning.training import distributed, run_scene
 from nsvq_lightning.training.module import LossTerm, SplatModule
 
 from .base import SplatCallback, has_gradients
@@ -52,7 +52,7 @@ class ExposureCompensation(SplatCallback):
             ValueError: The trainer has no data module with a scene, or the checkpoint is of another number of photos.
         """
         need = "exposures are those of the train photos"
-        scene = scene_module.needed_scene(trainer, need, "leave out ExposureCompensation")
+        scene = run_scene.needed_scene(trainer, need, "leave out ExposureCompensation")
         self._row = {view: row for row, view in enumerate(scene.train)}
         start = torch.zeros(len(scene.train), 3, 4)
         if self._loaded is not None:

@@ -12,7 +12,7 @@ from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import Splats
-from nsvq_lightning.training import optim, scene_module
+from nsvq_lightning.training import optim, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Schedule
 
@@ -91,7 +91,7 @@ def iterations_within(minutes: float, trainer: Trainer, module: SplatModule, sch
     Raises:
         ValueError: The trainer has no data module with a scene.
     """
-    scene = scene_module.needed_scene(trainer, "minutes are measured on the photos", "give trainer.max_steps")
+    scene = run_scene.needed_scene(trainer, "minutes are measured on the photos", "give trainer.max_steps")
     budget = module.splat_budget
     if module.stretches is None or budget is None:
         parts = [(1.0, budget or round(PAPER_SPLATS * splats_for_photos(len(scene.train), detailed_pixels(scene))))]

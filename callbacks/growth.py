@@ -21,12 +21,12 @@ from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, codebook_bits
 from nsvq_lightning.splats.splats import RawSplats
-from nsvq_lightning.training import distributed, scene_module
+from nsvq_lightning.training import distributed, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
 from .base import SplatCallback
-from .density import Densification
+from .density import Densification, reset_opacities
 from .settings import ABOVE_0, AT_LEAST_1, Count, NonNegative, Opacity, Positive, Share, Whole
 
 log = logging.getLogger(__name__)
@@ -74,7 +74,7 @@ class SplatBudget(SplatCallback):
             reason = f"for a file of {self.bytes} bytes"
         elif self.splats is None:
             advice = "give a number of splats (--splats) or bytes (--bytes)"
-            scene = scene_module.needed_scene(trainer, "a budget from the photos needs them", advice)
+            scene = run_scene.needed_scene(trainer, "a budget from the photos needs them", advice)
             detail = distributed.on_first_process(trainer, partial(detailed_pixels, scene))
             budget = splats_for_photos(len(scene.train), detail, self.quality)
             reason = (
@@ -209,7 +209,7 @@ class BudgetedGrowth(Densification):
 
     def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Find the photos of the scene, which know their edges."""
-        scene = scene_module.scene_of(trainer)
+        scene = run_scene.scene_of(trainer)
         self._photos = None if scene is None else scene.images
 
     def limit(self, module: SplatModule) -> int:
@@ -258,7 +258,7 @@ class BudgetedGrowth(Densification):
             self._split_and_prune(trainer, module, iteration)
         resets = schedule.reset_times(self.reset_last, self.reset_every)
         if iteration in resets:
-            self.reset_opacities(trainer, module, self.reset_opacity)
+            reset_opacities(trainer, module, self.reset_opacity)
         if iteration in (reset + schedule.interval(self.recovery) for reset in resets[: self.recoveries]):
             transparency = -module.splats.opacities
             self.prune(trainer, module, most_contributing(transparency, int(self.recovery_share * len(transparency))))

@@ -19,7 +19,7 @@ from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.report import files, viewer
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
-from nsvq_lightning.training.scene_module import scene_of
+from nsvq_lightning.training.run_scene import scene_of
 
 from .base import WritingCallback, picture_file
 
@@ -137,7 +137,7 @@ class LiveScene(WritingCallback):
             return
         began = time.monotonic()
         with module.stopwatch.paused(module.device):
-            splats = type(module.splats).from_tensors(*module.hard_splats(module.phase)).to("cpu")
+            splats = type(module.splats).from_tensors(*module.scene.hard_splats(module.phase)).to("cpu")
             state = {"iteration": trainer.global_step, "of": trainer.max_steps, "phase": module.phase.name.lower()}
             if module.history:
                 state["psnr"] = f"{module.history[-1]['psnr']:.2f}"

@@ -8,7 +8,7 @@ from lightning.pytorch import Trainer
 
 from nsvq_lightning.compression.importance import below_cap, likely_effects, most_contributing
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.training import distributed, row_ops, scene_module
+from nsvq_lightning.training import distributed, row_ops, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -83,7 +83,7 @@ class SplatSelection(SplatCallback):
         if budget is None or count <= budget or not self.is_due(module, iteration):
             return
         splats = below_cap(module.splats.raw())
-        views = scene_module.train_sensitivities(trainer, module, splats, VIEWS)
+        views = run_scene.train_sensitivities(trainer, module.scene, module.seed, splats, VIEWS)
         squares = sum((found.opacities for _, found, _ in views), torch.zeros_like(splats.opacities))
         effects = likely_effects(splats, distributed.sum_over_processes(trainer, squares))
         row_ops.keep_rows(module.splats, trainer.optimizers[0], most_contributing(effects, budget))

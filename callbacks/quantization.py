@@ -19,11 +19,11 @@ from nsvq_lightning.quantize.codebook import Quantizer, held_codes
 from nsvq_lightning.quantize.nearest import cheapest, code_rates
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import canonical
-from nsvq_lightning.training import distributed, optim, row_ops, scene_module
+from nsvq_lightning.training import distributed, optim, row_ops, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
-from .base import SplatCallback, finite_search_is_due, keep_finite_splats
+from .base import SplatCallback, finite_search_is_due, first_time, keep_finite_splats
 from .settings import Count, Factor, Positive
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ class CanonicalCovariance(SplatCallback):
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Act before the first iteration of a run that starts in the quantize phase."""
-        if self._first_time("after", trainer.global_step):
+        if first_time(self, "after", trainer.global_step):
             self.after_step(trainer, module, trainer.global_step)
 
     def is_due(self, module: SplatModule, iteration: int) -> bool:
@@ -104,14 +104,16 @@ class CodebookInit(SplatCallback):
             return
         keep_finite_splats(trainer, module)
         weighted = self.weights == "contribution"
-        weights = row_weights(scene_module.train_contributions(trainer, module)) if weighted else None
+        weights = row_weights(run_scene.train_contributions(trainer, module.scene)) if weighted else None
         for name, quantizer in module.quantizers.items():
             if trainer.is_global_zero:
                 if self.values_per_splat is not None and hasattr(quantizer, "limit"):
                     values = self.values_per_splat * len(module.splats)
                     quantizer.limit(max(1, int(values / quantizer.codebook.shape[1])))
                 weight = None if name == "scales" else weights
-                quantizer.fit(module.rows(name), weight, generator=generator(module.seed, iteration, "kmeans", name))
+                quantizer.fit(
+                    module.scene.rows(name), weight, generator=generator(module.seed, iteration, "kmeans", name)
+                )
             if trainer.world_size > 1:  # a fit may leave fewer codes, so counters and all other buffers must follow
                 distributed.follow_first(trainer.strategy, cast(nn.Module, quantizer))
         sizes = ", ".join(f"{name} {q.codebook.shape[0]}" for name, q in module.quantizers.items())
@@ -186,7 +188,7 @@ class CodebookReplacement(SplatCallback):
             if self.jitter is None:
                 replaced = quantizer.replace_unused(draws)
             else:
-                replaced = quantizer.replace_unused(draws, rows=module.rows(name), jitter=self.jitter)
+                replaced = quantizer.replace_unused(draws, rows=module.scene.rows(name), jitter=self.jitter)
             values[f"codebook/{name}_replaced"] = float(len(replaced))
             if self.reset_moments:
                 row_ops.reset_moments(trainer.optimizers[0], optim.codebook_group(name), replaced)
@@ -258,7 +260,7 @@ class CodebookRefit(SplatCallback):
             return
         for name, quantizer in _refittable(module).items():
             if trainer.is_global_zero:
-                quantizer.refit(module.rows(name), self.steps)
+                quantizer.refit(module.scene.rows(name), self.steps)
             quantizer.codebook.data = distributed.from_first_process(trainer, quantizer.codebook.data)
             log.debug("iteration %d: refitted the codebook of %s", iteration, name)
 
@@ -329,10 +331,10 @@ class RateDistortion(SplatCallback):
         return all(len(price) == len(module.splats) for price in (self.prices or {}).values())
 
     def _measure(self, trainer: Trainer, module: SplatModule) -> None:
-        splats, quantizers = module.hard_splats(Phase.QUANTIZE), module.quantizers.items()
+        splats, quantizers = module.scene.hard_splats(Phase.QUANTIZE), module.quantizers.items()
         shown = {name: torch.zeros_like(splats.opacities) for name, each in quantizers if hasattr(each, "hold")}
         error = torch.zeros((), dtype=torch.float64, device=module.device)
-        for view, squares, image in scene_module.train_sensitivities(trainer, module, splats, VIEWS):
+        for view, squares, image in run_scene.train_sensitivities(trainer, module.scene, module.seed, splats, VIEWS):
             error += (apply_mask(image, view.mask) - eight_bit(view.image)).square().sum(dtype=torch.float64)
             for name, total in shown.items():
                 total += getattr(squares, name).flatten(1).mean(1)
@@ -344,7 +346,7 @@ class RateDistortion(SplatCallback):
 
     def _choose(self, module: SplatModule, part: slice) -> None:
         for name, price in (self.prices or {}).items():
-            quantizer, rows = module.quantizers[name], module.rows(name)
+            quantizer, rows = module.quantizers[name], module.scene.rows(name)
             codes = attributes.codes_of(module.splats.raw(), name, quantizer).clone()
             rates = code_rates(codes, len(quantizer.codebook))
             codes[part] = cheapest(rows[part], quantizer.codebook, rates, price[part])
@@ -378,7 +380,7 @@ class FiniteCodes(SplatCallback):
             found = f"step {iteration}: {len(broken)} of {len(quantizer.codebook)} codes of {name} are non-finite"
             if len(broken) == len(quantizer.codebook) or not hasattr(quantizer, "mend"):
                 raise FloatingPointError(f"{found}; lower the learning rates")
-            quantizer.mend(broken, module.rows(name), generator(module.seed, iteration, "mend", name))
+            quantizer.mend(broken, module.scene.rows(name), generator(module.seed, iteration, "mend", name))
             row_ops.reset_moments(trainer.optimizers[0], optim.codebook_group(name), broken)
             rows = ", ".join(map(str, broken[:5].tolist())) + ", …" * (len(broken) > 5)
             log.warning("%s (rows %s); mended", found, rows)
@@ -411,7 +413,7 @@ class FreezeCodes(SplatCallback):
             RuntimeError: A codebook has never been placed.
         """
         iteration = trainer.global_step + 1
-        if self.is_due(module, iteration) and self._first_time("before", iteration):
+        if self.is_due(module, iteration) and first_time(self, "before", iteration):
             self._freeze(trainer, module, module.quantizers)
         elif stale := self._stale(module):
             if not self._warned:
@@ -437,7 +439,7 @@ class FreezeCodes(SplatCallback):
         for name in names:
             quantizer = module.quantizers[name]
             held = held_codes(quantizer, len(module.splats))
-            codes = quantizer.encode(module.rows(name)) if held is None else held
+            codes = quantizer.encode(module.scene.rows(name)) if held is None else held
             # Only now: some quantizers place their codebooks when rows are encoded.
             if not getattr(quantizer, "fitted", True):
                 raise RuntimeError(

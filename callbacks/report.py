@@ -1,9 +1,6 @@
 """Measure the run: curves while it trains, and the quality of the decoded file at the end."""
 
 import logging
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
@@ -14,7 +11,6 @@ from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from torch import Tensor
 from torchmetrics import Metric
 
-from nsvq_lightning.compute.jit import compile_seconds
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import optional
 from nsvq_lightning.io.compressed import CompressedScene
@@ -25,6 +21,7 @@ from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_b
 from nsvq_lightning.report import files, page
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
+from nsvq_lightning.training.stopwatch import TimesBeside
 
 from .base import WritingCallback, picture_file
 from .settings import Whole
@@ -80,7 +77,6 @@ class MetricReport(WritingCallback):
     """Measure LPIPS in ``test`` if torchvision and its weights are installed."""
     pictures: bool = True
     """Write a picture of each test view."""
-    _compiled_before = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,11 +85,11 @@ class MetricReport(WritingCallback):
         self._scores: list[dict[str, Any]] = []
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
-        self._seconds: dict[str, float] = {}
+        self._beside = TimesBeside()
 
     def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Forget the times of an earlier fit of this process."""
-        self._seconds, self._compiled_before = {}, compile_seconds()
+        self._beside = TimesBeside()
 
     # During training
 
@@ -138,14 +134,14 @@ class MetricReport(WritingCallback):
         datamodule = getattr(trainer, "datamodule", None)
         if datamodule is None or not datamodule.scene.test:
             return
-        with module.stopwatch.paused(module.device), self._timed("evaluations"):
+        with module.stopwatch.paused(module.device), self._beside.timed("evaluations"):
             self._evaluate(trainer, module, iteration, datamodule.test_dataloader())
             notify_monitors(trainer, module)
 
     @torch.no_grad()
     def _evaluate(self, trainer: Trainer, module: SplatModule, iteration: int, views: Any) -> None:
         phase = module.schedule.phase_at(iteration)
-        splats, folder = module.hard_splats(phase), run_folder(trainer)
+        splats, folder = module.scene.hard_splats(phase), run_folder(trainer)
 
         def show(image: Tensor, photo: Tensor) -> None:
             if self.pictures and trainer.is_global_zero:
@@ -153,7 +149,7 @@ class MetricReport(WritingCallback):
                     files.write_png(folder / "preview.png", torch.cat([eight_bit(photo), image], dim=1))
 
         mean_psnr, mean_ssim = files.evaluate(
-            lambda camera: module.render_splats(splats, camera).image, views, module.device, show
+            lambda camera: module.scene.render(splats, camera).image, views, module.device, show
         )
         entry: dict[str, Any] = {
             "iteration": iteration,
@@ -168,22 +164,11 @@ class MetricReport(WritingCallback):
             with optional(folder / "curve.csv"):
                 files.write_csv(folder / "curve.csv", module.history)
             with optional(folder / page.NAME):
-                page.write_page(folder, module.history, module.schedule, self._other_seconds())
+                page.write_page(folder, module.history, module.schedule, self._beside.seconds())
         values = {f"report/{name}": float(entry[name]) for name in ("psnr", "ssim", "splats")}
         trainer.callback_metrics.update({name: torch.tensor(value) for name, value in values.items()})
         for logger in trainer.loggers:
             logger.log_metrics(values, iteration)
-
-    def _other_seconds(self) -> dict[str, float]:
-        """Seconds that went into anything but training steps, by what it was."""
-        return {"kernels compiled": compile_seconds() - self._compiled_before, **self._seconds}
-
-    @contextmanager
-    def _timed(self, part: str) -> Iterator[None]:
-        """Add the time of the body to a part that is no training."""
-        start = time.perf_counter()
-        yield
-        self._seconds[part] = self._seconds.get(part, 0.0) + time.perf_counter() - start
 
     # In test
 
@@ -193,7 +178,7 @@ class MetricReport(WritingCallback):
         if is_fast_dev_run(trainer):
             return
         path = run_folder(trainer) / "scene.nsvq"
-        with self._timed("file written and read"):
+        with self._beside.timed("file written and read"):
             if trainer.is_global_zero:
                 scene = module.compressed()
                 save(scene, path, module.storage)
@@ -248,7 +233,7 @@ class MetricReport(WritingCallback):
             paths = [picture_file(trainer, folder / "renders", score["name"]) for score in scores]
             views = [score | {"picture": path.name} for score, path in zip(scores, paths, strict=True)]
             with optional(folder / page.NAME):
-                told = module.history, module.schedule, self._other_seconds(), metrics, views
+                told = module.history, module.schedule, self._beside.seconds(), metrics, views
                 log.info("report: %s", page.write_page(folder, *told))
             if self.pictures:
                 files.log_pictures(trainer.loggers, [path for path in paths if path.exists()], trainer.global_step)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 from lightning.pytorch import Trainer
 
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.training import scene_module
+from nsvq_lightning.training import run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
@@ -130,7 +130,7 @@ class PhaseSchedule(SplatCallback):
                 log.warning("that is few: smaller photos (--data.factor=2) or fewer splats (--quality=0.5) give more")
         elif self.iterations_per_photo is not None and self.total is None:
             need = "a number of iterations for each photo needs the photos"
-            photos = len(scene_module.needed_scene(trainer, need, "leave iterations_per_photo unset").train)
+            photos = len(run_scene.needed_scene(trainer, need, "leave iterations_per_photo unset").train)
             asked = self._asked if trainer.max_steps == self._max_steps else trainer.max_steps
             self._asked, steps = asked, self.limited(asked, photos)
             if steps != trainer.max_steps:

@@ -37,7 +37,7 @@ from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import eight_bit, psnr
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats.conventions import Uint8s
-from nsvq_lightning.training.resume import ResumedModule
+from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
 Values = Mapping[str, Any]
@@ -83,7 +83,7 @@ def summarize(
     scene: CompressedScene,
     scores: Sequence[Values],
     lpips: tuple[float | None, str | None],
-    module: ResumedModule,
+    module: SplatModule,
     paper: Values,
 ) -> dict[str, Any]:
     """The content of ``metrics.json``; sizes in bytes, PSNR in dB, times in seconds.

@@ -2,29 +2,37 @@
 
 import logging
 import math
+import os
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, Self, cast
 
 import torch
+from lightning.pytorch import LightningModule
+from lightning.pytorch.utilities.model_helpers import _restricted_classmethod
 from torch import Tensor, nn
 
 from nsvq_lightning.compute.devices import AsyncScalar, check_can_train, to_device
 from nsvq_lightning.compute.jit import check_threads
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.precision import Storage
-from nsvq_lightning.quality.loss import photometric_loss
+from nsvq_lightning.quality.loss import apply_mask, photometric_loss, ssim
 from nsvq_lightning.quality.metrics import eight_bit, psnr
 from nsvq_lightning.quantize.attributes import build_quantizers, decoded, noisy_rows
+from nsvq_lightning.quantize.codebook import Quantizer
 from nsvq_lightning.quantize.straight_through import TrainedStraightThrough
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.rendering.rasterize import Render, visible
-from nsvq_lightning.splats.splats import RawSplats, Splats, detached
-from nsvq_lightning.training import distributed, optim, resume, scene_module
-from nsvq_lightning.training.scene_module import Stopwatch
+from nsvq_lightning.splats.splats import Splats, SplatTensors, detached
+from nsvq_lightning.training import distributed, optim, resume, run_scene
 from nsvq_lightning.training.schedule import Phase, Schedule
+from nsvq_lightning.training.self_check import check_device
+from nsvq_lightning.training.splat_scene import SplatScene
+from nsvq_lightning.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +40,7 @@ log = logging.getLogger(__name__)
 LossTerm = Callable[[Render, View], Tensor]
 
 
-class SplatModule(resume.ResumedModule):
+class SplatModule(LightningModule):
     """Trains 3D Gaussian splats and the codebooks that store them (NSVQ-GS).
 
     A step renders one view and computes the sum of :attr:`loss_terms`. What it renders depends on the phase:
@@ -86,10 +94,13 @@ class SplatModule(resume.ResumedModule):
         if not 0.0 <= dssim_weight <= 1.0:
             raise ValueError(f"dssim_weight must be between 0 and 1, got {dssim_weight}")
         self.splats = splats if splats is not None else Splats(sh_degree)
+        """The splats, in :attr:`frame`; rows are edited only through :mod:`nsvq_lightning.training.row_ops`."""
         self.codebooks = nn.ModuleDict(build_quantizers(quantizer, codebooks, self.splats))
         self.quantizer_settings = {
-            name: {"quantizer": type(q).__name__, "codes": q.codebook.shape[0]} for name, q in self.quantizers.items()
+            name: {"quantizer": type(made).__name__, "codes": made.codebook.shape[0]}
+            for name, made in self.quantizers.items()
         }
+        """Class and number of codes of each quantizer by attribute, as requested; k-means may give fewer codes."""
         self.background: str = background
         self.dssim_weight = dssim_weight
         # A checkpoint stores these two as plain dictionaries.
@@ -100,30 +111,74 @@ class SplatModule(resume.ResumedModule):
         self.seed = seed
         self.init_from = init_from
         self.save_hyperparameters(ignore=["splats"])
-        self.phase = Phase.WARMUP
-        self.active_sh_degree = 0 if splats is None else splats.sh_degree
-        self.extent = 0.0
         self.frame = Frame()
-        self.stopwatch = Stopwatch()
+        """Coordinates of the splats; the module is given cameras, and makes files, in those of the files."""
+        self.extent = 0.0
+        """Of the cameras, in units of the frame; 0 while unknown."""
         self.schedule = Schedule()
-        self.loss_terms: dict[str, LossTerm] = {"photometric": self._photometric_term}
+        """Phases and milestones of the run."""
+        self.phase = Phase.WARMUP
+        """Phase of the current iteration."""
+        self.active_sh_degree = 0 if splats is None else splats.sh_degree
+        """SH degree that is rendered; higher coefficients are ignored."""
+        self.history: list[dict[str, Any]] = []
+        """Evaluations so far, one plain dictionary each; checkpoints carry it."""
+        self.stopwatch = Stopwatch()
+        """Time spent training."""
+        self.loss_terms: dict[str, LossTerm] = {"photometric": partial(_photometric_term, self)}
         """Terms of the loss by name; callbacks add some, or wrap the first."""
         self.pixel_weights: Tensor | None = None
         """Strength ``[H, W]`` of the pixels of the next view, whose rendering then has ``absgrad``, or None."""
         self.splat_budget: int | None = None
         """How many splats the scene is to have in the end; None for as many as density control makes."""
+        self.first_points: int | None = None
+        """How many points of SfM and of flow the first splats are made from; None for those of SfM, as in 3DGS."""
         self.rate_strength = 0.0
         """How strongly codes are chosen by their bits, which a budget in bytes counts on; 0 for the nearest ones."""
         self.stretches: Callable[[Schedule, int, int], list[tuple[float, int]]] | None = None
         """How many splats a run has in which shares of it, from its schedule and how many it has at start and end."""
-        self.evaluation_splats = None
-        self.history: list[dict[str, Any]] = []
-        self._step_factor = 1.0
-        self._rate_factors: dict[str, float] = {}
+        self.evaluation_splats: SplatTensors | None = None
+        """What validation, test and prediction render instead of the module's own splats, in :attr:`frame`."""
         self.updates = True
         """Whether this iteration is to change anything: False once a loss of this process is not finite."""
-        self._late_loss: tuple[str, AsyncScalar] | None = None
-        self._micro_batch = 0
+        self._step_factor = 1.0
+        self._rate_factors: dict[str, float] = {}
+        self._late_losses: list[tuple[str, AsyncScalar]] = []
+        self._view_of_step = 0
+
+    @property
+    def quantizers(self) -> Mapping[str, Quantizer]:
+        """Quantizer by attribute; empty for a run without quantization."""
+        return cast("Mapping[str, Quantizer]", dict(self.codebooks.items()))
+
+    @property
+    def scene(self) -> SplatScene:
+        """What is trained, as it is now: renders any splats, and gives the rows that codebooks are placed on."""
+        return SplatScene(
+            splats=self.splats,
+            quantizers=self.quantizers,
+            frame=self.frame,
+            sh_degree=self.active_sh_degree,
+            background=self.background,
+            antialiased=self.antialiased,
+            backend=self.backend,
+        )
+
+    def compressed(self) -> CompressedScene:
+        """The scene as it is stored, in the coordinates of its files (:meth:`SplatScene.compressed`).
+
+        Raises:
+            ValueError: There are no splats.
+        """
+        # Nothing that differs between two runs with the same seed.
+        settings = {
+            "phase_ends": list(self.schedule.ends),
+            "rates": asdict(self.rates),
+            "dssim_weight": self.dssim_weight,
+            "extent": self.extent * self.frame.unit,
+            "seed": self.seed,
+        }
+        return self.scene.compressed(self.phase, settings)
 
     def scale_rate(self, group: str, factor: float) -> None:
         """Multiply the learning rate of a parameter group in the iteration that starts.
@@ -140,28 +195,21 @@ class SplatModule(resume.ResumedModule):
             camera: Where to look from, in the coordinates of the files.
             pixel_weights: Strength of each pixel ``[H, W]``, see :func:`nsvq_lightning.render`.
         """
+
+        def draws(*salts: str) -> torch.Generator:
+            # It lives on the CPU: quantizers draw a seed from it.
+            return generator(self.seed, self.global_step, 0, *salts, self._view_of_step)
+
+        splats, quantizers = self.splats.raw(), self.quantizers
+        if self.phase is Phase.QUANTIZE and self.training and quantizers:
+            rows = visible(splats, self.frame.camera(camera), backend=self.backend)
+            splats = noisy_rows(splats, rows, quantizers, lambda name: draws("noise", name))
+        elif self.phase >= Phase.QUANTIZE:
+            splats = decoded(splats, quantizers)
         options: dict[str, Any] = {"pixel_weights": pixel_weights}
-        if self.training and self.background == "random":
-            options["background"] = to_device(torch.rand(3, generator=self._generator("background")), self.device)
-        return self.render_splats(self._phase_splats(camera), camera, **options)
-
-    def _phase_splats(self, camera: Camera) -> RawSplats:
-        raw, camera = self.splats.raw(), self.frame.camera(camera)
-        if self.phase < Phase.QUANTIZE or not self.codebooks:
-            return raw
-        if self.phase is Phase.QUANTIZE and self.training:
-            rows = visible(raw, camera, backend=self.backend)
-            return noisy_rows(raw, rows, self.quantizers, lambda name: self._generator("noise", name))
-        return decoded(raw, self.quantizers)
-
-    def _generator(self, *salts: str) -> torch.Generator:
-        """Generator of one view of this step; quantizers draw a seed from it, so it lives on the CPU.
-
-        It depends on the view's number in the step, not on the process: 2 processes with a view each draw what one
-        process with 2 micro-batches draws.
-        """
-        processes = 1 if self._trainer is None else self._trainer.world_size
-        return generator(self.seed, self.global_step, 0, *salts, self._micro_batch * processes + self.global_rank)
+        if self.background == "random" and self.training:
+            options["background"] = to_device(torch.rand(3, generator=draws("background")), self.device)
+        return self.scene.render(splats, camera, **options)
 
     def setup(self, stage: str) -> None:
         """Set the background and the extent of the scene.
@@ -177,34 +225,37 @@ class SplatModule(resume.ResumedModule):
                 "whatever it says, and a scaled loss would grow splats needlessly; leave it at 32-true"
             )
         self.evaluation_splats = None  # an interrupted evaluation may have left some
-        scene = scene_module.scene_of(self.trainer)
+        scene = run_scene.scene_of(self.trainer)
         if scene is not None:
-            self.background = scene_module.background_of(scene, self.background)
-        if stage == "fit":
-            if scene is not None and self.frame == Frame():
-                self._enter(scene.frame)
-            distributed.check_strategy(self.trainer.strategy)
-            check_threads()
-            extent = partial(scene_module.extent_of, self.trainer)
-            self.extent = self.extent or distributed.on_first_process(self.trainer, extent)
-
-    def _enter(self, frame: Frame) -> None:
-        """Take splats that came with the coordinates of the files into the frame that they will be trained in."""
-        self.frame = frame
-        for tensor, moved in zip(detached(self.splats), frame.splats(self.splats), strict=True):
-            tensor.copy_(moved)
+            self.background = run_scene.background_of(scene, self.background)
+        if stage != "fit":
+            return
+        if scene is not None and self.frame == Frame():
+            self.frame = scene.frame
+            # Splats that were given came with the coordinates of the files.
+            for tensor, moved in zip(detached(self.splats), self.frame.splats(self.splats), strict=True):
+                tensor.copy_(moved)
+        distributed.check_strategy(self.trainer.strategy)
+        check_threads()
+        if not self.extent:
+            self.extent = distributed.on_first_process(self.trainer, partial(run_scene.extent_of, self.trainer))
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """One Adam optimiser with a named group for each attribute and codebook; first splats, if there are none."""
         if len(self.splats) == 0:
-            splats = distributed.on_first_process(self.trainer, partial(scene_module.first_splats, self))
-            self.splats = splats.to(self.device)
-            self.active_sh_degree = 0 if self.init_from is None else self.splats.sh_degree
+            degree = self.splats.sh_degree
+            if self.init_from is None:
+                make = partial(run_scene.first_splats, self.trainer, degree, self.first_points, self.seed)
+                self.active_sh_degree = 0
+            else:
+                make = partial(run_scene.splats_of_file, self.init_from, self.frame, degree)
+                self.active_sh_degree = degree
+            self.splats = distributed.on_first_process(self.trainer, make).to(self.device)
         return optim.build_adam(optim.param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
 
     def on_train_start(self) -> None:
         """Set Adam's numbers of this run, not those of a checkpoint; start measuring the training time."""
-        scene_module.check_device(self.device)
+        check_device(self.device)
         views = self.trainer.world_size * self.trainer.accumulate_grad_batches
         optim.check_groups(self.trainer.optimizers, self.quantizers)
         self._step_factor = optim.adapt_to_views(self.trainer.optimizers[0], self.rates, views)
@@ -212,19 +263,17 @@ class SplatModule(resume.ResumedModule):
 
     def on_train_batch_start(self, batch: View, batch_idx: int) -> None:
         """Set the learning rates of this iteration."""
-        self._micro_batch = batch_idx % self.trainer.accumulate_grad_batches
-        if self._micro_batch == 0:
+        micro_batch = batch_idx % self.trainer.accumulate_grad_batches
+        if micro_batch == 0:
             self.updates = True
+        # 2 processes with a view each draw what one process with 2 micro-batches draws.
+        self._view_of_step = micro_batch * self.trainer.world_size + self.global_rank
         end = self.schedule.iteration(self.schedule.position_decay)
         for group in self.trainer.optimizers[0].param_groups:
             rate = optim.group_lr(group["name"], self.rates, self.extent)
             if group["name"] == "means":
                 rate = optim.position_lr(self.global_step + 1, self.extent, self.rates, end)
             group["lr"] = self._step_factor * rate * self._rate_factors.pop(group["name"], 1.0)
-
-    def _photometric_term(self, rendered: Render, view: View) -> Tensor:
-        """(1 - w)·L1 + w·(1 - SSIM) of picture and photo (paper, section 3.3)."""
-        return photometric_loss(rendered.image, view.image, self.dssim_weight, view.mask)
 
     def training_step(self, batch: View, batch_idx: int) -> dict[str, Any] | None:
         """The sum of the loss terms of one view.
@@ -248,30 +297,127 @@ class SplatModule(resume.ResumedModule):
             self.log_dict(values, batch_size=1)  # type: ignore[arg-type]  # a number among tensors
         late_loss = AsyncScalar(loss)
         if not late_loss.is_here:
-            self._late_loss = batch.name, late_loss
-        elif not self._has_finite_loss(batch.name, late_loss):
+            self._late_losses.append((batch.name, late_loss))
+        elif not _is_finite(late_loss, batch.name, self.global_step):
+            self.updates = False
+            self.zero_grad()
             return {"loss": loss} if self.trainer.world_size > 1 else None
         return {"loss": loss, "render": rendered, "edits": edits, "late_loss": late_loss}
 
-    def _has_finite_loss(self, view: str, loss: AsyncScalar) -> bool:
-        """Whether the loss of a view is finite; otherwise say so, and let the step update nothing."""
-        if math.isfinite(loss.read()):
-            return True
-        log.warning("step %d: the loss of %s is %s, no update", self.global_step + 1, view, loss.read())
-        self.updates = False
-        return False
-
     def on_after_backward(self) -> None:
-        """Look at a loss that was still on its way when the backward pass was launched."""
-        if self._late_loss is not None:
-            self._has_finite_loss(*self._late_loss)
-            self._late_loss = None
-
-    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Drop the gradients of a step that must not update; with several processes the strategy has done so."""
+        """Look at a loss that was still on its way; of a step that must not update, drop the gradients."""
+        for view, loss in self._late_losses:
+            self.updates &= _is_finite(loss, view, self.global_step)
+        self._late_losses.clear()
         if not self.updates:
-            optimizer.zero_grad()
+            self.zero_grad()
 
     def on_train_end(self) -> None:
         """Stop measuring the training time."""
         self.stopwatch.stop()
+
+    def _start_evaluation(self) -> None:
+        if len(self.splats) == 0:
+            raise ValueError("there are no splats to render: pass the checkpoint of a run (--ckpt_path)")
+        if self.evaluation_splats is None:
+            self.evaluation_splats = self.scene.hard_splats(self.phase)
+
+    def _end_evaluation(self) -> None:
+        self.evaluation_splats = None
+
+    on_validation_start = on_test_start = on_predict_start = _start_evaluation
+    on_validation_end = on_test_end = on_predict_end = _end_evaluation
+
+    def predict_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
+        """Render one view: ``name`` and ``image [H, W, 3]`` (8-bit values in [0, 1])."""
+        if self.evaluation_splats is None:
+            raise RuntimeError("evaluation steps run only inside Trainer.validate, test or predict")
+        image = self.scene.render(self.evaluation_splats, batch.camera).image
+        return {"name": batch.name, "image": eight_bit(image)}
+
+    def test_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
+        """Score one view: ``image [H, W, 3]`` (8-bit values in [0, 1]), ``psnr``, ``ssim``."""
+        image = apply_mask(self.predict_step(batch, batch_idx)["image"], batch.mask)
+        photo = eight_bit(batch.image)
+        scores = {"psnr": psnr(image, photo, batch.mask).float(), "ssim": ssim(image, photo, batch.mask)}
+        prefix = "test" if self.trainer.testing else "val"
+        self.log_dict({f"{prefix}/{name}": score for name, score in scores.items()}, batch_size=1, sync_dist=True)
+        return {"image": image, **scores}
+
+    validation_step = test_step
+
+    @_restricted_classmethod
+    def load_from_checkpoint(cls, checkpoint_path: Any, *args: Any, **settings: Any) -> Self:
+        """Lightning's, which would also import what the checkpoint names; here only the user names what to import.
+
+        Args:
+            checkpoint_path: File or address.
+            *args: Lightning's arguments.
+            **settings: Those by name, and arguments of this class that replace the checkpoint's.
+
+        Raises:
+            FormatError: The checkpoint is damaged, or its settings name something that has not been imported.
+        """
+        checkpoint = resume.PlainCheckpointIO().load_checkpoint(os.fspath(checkpoint_path))
+        stored = checkpoint.get(cls.CHECKPOINT_HYPER_PARAMS_KEY, {})
+        resume.check_settings(checkpoint_path, {k: v for k, v in stored.items() if k not in settings})
+        return super().load_from_checkpoint(checkpoint_path, *args, **settings)
+
+    def get_extra_state(self) -> Tensor:
+        """Phase, SH degree, extent, seconds of training, unit, middle and origin of the frame ``[11]``, float64."""
+        self.stopwatch.lap()
+        values = self.phase, self.active_sh_degree, self.extent, self.stopwatch.seconds
+        return torch.tensor([*values, self.frame.unit, *self.frame.middle, *self.frame.origin], dtype=torch.float64)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Go on from these."""
+        phase, degree, self.extent, self.stopwatch.seconds, unit, *places = state.tolist()
+        self.phase = Phase(int(phase))
+        self.active_sh_degree = int(degree)
+        self.frame = Frame(unit, tuple(places[:3]), tuple(places[3:]))
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add history, schedule, quantizers and scene; plain data only, so that ``weights_only=True`` can read it."""
+        checkpoint["history"] = self.history
+        checkpoint["schedule"] = asdict(self.schedule)
+        checkpoint[resume.QUANTIZER_SETTINGS] = self.quantizer_settings
+        scene = run_scene.scene_of(self._trainer)
+        if scene is not None:
+            checkpoint[resume.SCENE] = resume.scene_record(scene)
+        stored = checkpoint.get(self.CHECKPOINT_HYPER_PARAMS_KEY)
+        if stored is not None:
+            # Without the photos nobody knows what "auto" was.
+            checkpoint[self.CHECKPOINT_HYPER_PARAMS_KEY] = resume.plain(stored) | {"background": self.background}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Restore history and schedule; a fit keeps its own schedule.
+
+        Raises:
+            ValueError: A fit cannot continue from the checkpoint, or it is of another scene than the trainer's, which
+                ``allow_other_scene`` of :class:`nsvq_lightning.training.trainer.SplatTrainer` lets pass.
+        """
+        scene = run_scene.scene_of(self._trainer)
+        if scene is not None and resume.SCENE in checkpoint and not getattr(self._trainer, "allow_other_scene", False):
+            resume.check_scene(checkpoint, scene)
+        self.history = list(checkpoint["history"])
+        if self._trainer is None or self._trainer.state.fn != "fit":
+            self.schedule = Schedule(**checkpoint["schedule"])
+            return
+        self.schedule = resume.continued_schedule(checkpoint, self.schedule)
+        change = resume.changed_schedule(checkpoint, self.schedule)
+        if change is not None:
+            log.warning(change)
+        resume.check_continuation(checkpoint, self.state_dict(), self.quantizer_settings)
+
+
+def _photometric_term(module: SplatModule, rendered: Render, view: View) -> Tensor:
+    """(1 - w)·L1 + w·(1 - SSIM) of picture and photo (paper, section 3.3)."""
+    return photometric_loss(rendered.image, view.image, module.dssim_weight, view.mask)
+
+
+def _is_finite(loss: AsyncScalar, view: str, step: int) -> bool:
+    """Whether the loss of a view is finite; otherwise say so."""
+    value = loss.read()
+    if not math.isfinite(value):
+        log.warning("step %d: the loss of %s is %s, no update", step + 1, view, value)
+    return math.isfinite(value)

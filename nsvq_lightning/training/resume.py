@@ -1,7 +1,6 @@
 """Checkpoints that continue a run: read, checked, and never trusted to import anything."""
 
 import logging
-import os
 import re
 import sys
 from collections.abc import Collection, Iterator, Mapping
@@ -10,21 +9,18 @@ from hashlib import sha256
 from operator import attrgetter
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any, Self
+from typing import Any
 from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from lightning.pytorch.utilities.model_helpers import _restricted_classmethod
 from torch import Tensor
 
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.splats.splats import sh_degree_of
-from nsvq_lightning.training.scene_module import SceneModule, Stopwatch, scene_of
-from nsvq_lightning.training.schedule import Phase, Schedule
+from nsvq_lightning.training.schedule import Schedule
 
 log = logging.getLogger(__name__)
 
@@ -255,73 +251,3 @@ def _is_plain(value: Any) -> bool:
         return all(_is_plain(item) for item in value)
     # Exact types: an enum member or NumPy scalar is also an int or float, but not to the unpickler.
     return value is None or type(value) in (bool, int, float, str)
-
-
-class ResumedModule(SceneModule):
-    """A module whose checkpoints continue its run."""
-
-    quantizer_settings: dict[str, dict[str, Any]]
-    """Class and number of codes of each quantizer by attribute, as requested; k-means may give fewer codes."""
-    stopwatch: Stopwatch
-    history: list[dict[str, Any]]
-    """Evaluations so far, one plain dictionary each; checkpoints carry it."""
-
-    @_restricted_classmethod
-    def load_from_checkpoint(cls, checkpoint_path: Any, *args: Any, **settings: Any) -> Self:
-        """Lightning's, which would also import what the checkpoint names; here only the user names what to import.
-
-        Args:
-            checkpoint_path: File or address.
-            *args: Lightning's arguments.
-            **settings: Those by name, and arguments of this class that replace the checkpoint's.
-
-        Raises:
-            FormatError: The checkpoint is damaged, or its settings name something that has not been imported.
-        """
-        checkpoint = PlainCheckpointIO().load_checkpoint(os.fspath(checkpoint_path))
-        stored = checkpoint.get(cls.CHECKPOINT_HYPER_PARAMS_KEY, {})
-        check_settings(checkpoint_path, {k: v for k, v in stored.items() if k not in settings})
-        return super().load_from_checkpoint(checkpoint_path, *args, **settings)
-
-    def get_extra_state(self) -> Tensor:
-        """Phase, SH degree, extent, seconds of training, unit, middle and origin of the frame ``[11]``, float64."""
-        self.stopwatch.lap()
-        values = self.phase, self.active_sh_degree, self.extent, self.stopwatch.seconds
-        frame = self.frame
-        return torch.tensor([*values, frame.unit, *frame.middle, *frame.origin], dtype=torch.float64)
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Go on from these."""
-        phase, degree, self.extent, self.stopwatch.seconds, unit, *places = state.tolist()
-        self.frame = Frame(unit, tuple(places[:3]), tuple(places[3:]))
-        self.phase, self.active_sh_degree = Phase(int(phase)), int(degree)
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add history, schedule, quantizers and scene; plain data only, so that ``weights_only=True`` can read it."""
-        checkpoint["history"] = self.history
-        checkpoint[QUANTIZER_SETTINGS] = self.quantizer_settings
-        checkpoint["schedule"] = asdict(self.schedule)
-        if (scene := scene_of(self._trainer)) is not None:
-            checkpoint[SCENE] = scene_record(scene)
-        if (stored := checkpoint.get(self.CHECKPOINT_HYPER_PARAMS_KEY)) is not None:
-            # Without the photos nobody knows what "auto" was.
-            checkpoint[self.CHECKPOINT_HYPER_PARAMS_KEY] = plain(stored) | {"background": self.background}
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Restore history and schedule; a fit keeps its own schedule.
-
-        Raises:
-            ValueError: A fit cannot continue from the checkpoint, or it is of another scene than the trainer's, which
-                ``allow_other_scene`` of :class:`nsvq_lightning.training.trainer.SplatTrainer` lets pass.
-        """
-        scene = scene_of(self._trainer)
-        if scene is not None and SCENE in checkpoint and not getattr(self._trainer, "allow_other_scene", False):
-            check_scene(checkpoint, scene)
-        self.history = list(checkpoint["history"])
-        if self._trainer is None or self._trainer.state.fn != "fit":
-            self.schedule = Schedule(**checkpoint["schedule"])
-            return
-        self.schedule = continued_schedule(checkpoint, self.schedule)
-        if (change := changed_schedule(checkpoint, self.schedule)) is not None:
-            log.warning(change)
-        check_continuation(checkpoint, self.state_dict(), self.quantizer_settings)

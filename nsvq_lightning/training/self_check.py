@@ -1,11 +1,13 @@
 """Whether the kernels of a device compute what they should: each against the definition, on a tiny scene."""
 
 import logging
+import os
 
 import torch
 from torch import Tensor
 
 from nsvq_lightning.compute.devices import fast_backends
+from nsvq_lightning.compute.environment import came_late
 from nsvq_lightning.compute.kernel_cache import kernel_folder
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.quality.loss import photometric_loss
@@ -97,3 +99,14 @@ def check_kernels(device: torch.device) -> None:
 def written(errors: dict[str, float]) -> str:
     """Errors in one line."""
     return ", ".join(f"{name} {error:.1e}" for name, error in errors.items())
+
+
+def check_device(device: torch.device) -> None:
+    """Check the kernels of a GPU at its first use; on a CPU, warn of other processes that want the same cores."""
+    if device.type == "cuda":
+        check_kernels(device)
+    elif came_late and torch.get_num_threads() > 1 and hasattr(os, "getloadavg") and os.getloadavg()[0] > 1.0:
+        log.warning(
+            "other processes also need the cores, and idle threads occupy them: a run may take twice as long; "
+            "import nsvq_lightning before torch, or set OMP_WAIT_POLICY=passive"
+        )

@@ -42,7 +42,7 @@ class Viewer(Callback):
             self.seen[batch_idx] = load(path)
             self.said[batch_idx] = read_header(path).config["live"]
             path.unlink()
-            hard = CompressedScene.from_splats(pl_module.hard_splats(pl_module.phase))
+            hard = CompressedScene.from_splats(pl_module.scene.hard_splats(pl_module.phase))
             self.expected[batch_idx] = placed(hard, pl_module.frame).decode().raw()
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
 from numba import njit
@@ -19,7 +18,6 @@ from nsvq_lightning.callbacks.progress import SplatProgressBar
 from nsvq_lightning.compute import jit
 from nsvq_lightning.compute.jit import compile_seconds
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.scene_module import Stopwatch
 
 
 def compiled() -> Callable[[float], float]:
@@ -42,22 +40,6 @@ def test_the_clock_counts_compilation() -> None:
     assert compile_seconds() - before == took
     assert kernel(np.float32(1.0)) == 2.0  # other types are another compilation
     assert compile_seconds() - before > took
-
-
-def test_training_time_leaves_compilation_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [0.0, 0.0]
-    monkeypatch.setattr("nsvq_lightning.training.scene_module.time.perf_counter", lambda: now[0])
-    monkeypatch.setattr("nsvq_lightning.training.scene_module.compile_seconds", lambda: now[1])
-    watch = Stopwatch()
-    watch.start()
-    now[:] = [100.0, 93.0]
-    watch.lap()
-    assert watch.seconds == 7.0
-    with watch.paused(torch.device("cpu")):
-        now[:] = [120.0, 103.0]
-    now[:] = [121.0, 103.0]
-    watch.stop()
-    assert watch.seconds == 8.0
 
 
 @pytest.mark.parametrize("hours", [0, 20])

@@ -26,9 +26,8 @@ def selected(raw: RawSplats, selection: SplatSelection, budget: int | None = Non
     photos = [torch.zeros(camera.height, camera.width, 3) for camera in CAMERAS]
     views = [View(str(k), k, camera, photo) for k, (camera, photo) in enumerate(zip(CAMERAS, photos, strict=True))]
     scene = SimpleNamespace(some_train=lambda most: range(len(views)), view=views.__getitem__)
-    module: Any = SimpleNamespace(
-        splats=splats, schedule=SCHEDULE, seed=0, splat_budget=budget, device=torch.device("cpu"), render_splats=render
-    )
+    trained = SimpleNamespace(splats=splats, render=render)
+    module: Any = SimpleNamespace(splats=splats, schedule=SCHEDULE, seed=0, splat_budget=budget, scene=trained)
     trainer: Any = SimpleNamespace(
         optimizers=[build_adam(param_groups(splats, {}, LearningRates(), 1.0))],
         datamodule=SimpleNamespace(scene=scene),

@@ -126,7 +126,8 @@ def refit(trainer: Any, steps: int = 2) -> dict[str, Any]:
     quantizers = {"scales": StraightThrough(4, 3), "quats": NSVQ(4, 3)}
     for quantizer in quantizers.values():
         quantizer.fit(ROWS - 1)
-    host: Any = SimpleNamespace(schedule=Schedule(), quantizers=quantizers, rows=lambda name: ROWS)
+    scene = SimpleNamespace(rows=lambda name: ROWS)
+    host: Any = SimpleNamespace(schedule=Schedule(), quantizers=quantizers, scene=scene)
     CodebookRefit(steps=steps).on_before_optimizer_step(trainer, host, None)  # type: ignore[arg-type]
     return quantizers
 
@@ -173,7 +174,7 @@ class Stage:
             splats=self.splats,
             quantizers={"scales": self.quantizer},
             schedule=Schedule(),
-            rows=lambda name: self.splats.scales.detach(),
+            scene=SimpleNamespace(rows=lambda name: self.splats.scales.detach()),
         )
         self.trainer: Any = SimpleNamespace(optimizers=[self.optimizer], global_step=0, world_size=1)
         assert self.module.schedule.first_of(Phase.FINETUNE) == FIRST

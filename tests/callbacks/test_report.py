@@ -68,12 +68,12 @@ def test_what_a_run_is_for_must_be_written(
 
 def test_the_times_of_a_second_run_are_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     report, seconds = MetricReport(), [40.0]
-    monkeypatch.setattr("nsvq_lightning.callbacks.report.compile_seconds", lambda: seconds[0])
+    monkeypatch.setattr("nsvq_lightning.training.stopwatch.compile_seconds", lambda: seconds[0])
     nobody: Any = None
     for compiled in (40.0, 2.0):
         report.before_fit(nobody, nobody)
-        with report._timed("evaluations"):
+        with report._beside.timed("evaluations"):
             seconds[0] += compiled
-        told = report._other_seconds()
+        told = report._beside.seconds()
         assert told["kernels compiled"] == compiled
         assert told["evaluations"] < 1

@@ -485,7 +485,7 @@ def test_excluded_pixels_carry_no_loss_and_no_metric(demo_scene: Path, tmp_path:
         trainer.fit(module, data)
         scores = trainer.test(module, data, verbose=False)[0]
         results.append((scores, module.splats.means.detach().clone(), module.splats.sh0.detach().clone()))
-        image = module.render_splats(module.splats.raw(), data.scene.cameras[0]).image.detach()
+        image = module.scene.render(module.splats.raw(), data.scene.cameras[0]).image.detach()
         assert (image[mask == 0] > 0.05).any()  # something is there all the same
     (scores, *splats), (others, *others_splats) = results
     assert scores == others

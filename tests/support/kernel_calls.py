@@ -63,13 +63,13 @@ def compile_kernels(settings: dict[str, Any]) -> None:
     module.phase = Phase.QUANTIZE
     for name, quantizer in module.quantizers.items():
         weight = None if name == "scales" else row_weights(torch.ones(600))
-        quantizer.fit(module.rows(name), weight, generator(0, 0, name))
+        quantizer.fit(module.scene.rows(name), weight, generator(0, 0, name))
     raw = module.splats.raw()
     rows = visible(raw, front_camera())
     for _ in range(2):  # the second search has something to remember
         _backward(noisy_rows(raw, rows, module.quantizers, lambda name: generator(0, 1, name)))
     for name, quantizer in module.quantizers.items():
-        quantizer.freeze(quantizer.encode(module.rows(name)))
+        quantizer.freeze(quantizer.encode(module.scene.rows(name)))
     module.phase = Phase.FINETUNE
     _backward(decoded(raw, module.quantizers))
     with tempfile.TemporaryDirectory() as folder:

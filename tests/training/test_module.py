@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from lightning.pytorch import Trainer
-from runs import fit
 from torch import Tensor, nn
 
 from nsvq_lightning.callbacks import PhaseSchedule
-from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.io.formats import save
-from nsvq_lightning.quantize import PostHoc
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.module import SplatModule
-from nsvq_lightning.training.optim import LearningRates
-from nsvq_lightning.training.scene_module import first_splats
 from nsvq_lightning.training.schedule import Phase
 
 CODES = {"scales": 6, "quats": 5, "sh0": 4, "shN": 3}
@@ -56,7 +45,7 @@ def module() -> SplatModule:
     built = SplatModule(sh_degree=1, codebooks=CODES, splats=make_splats())
     built.active_sh_degree = 1
     for name, quantizer in built.quantizers.items():
-        quantizer.fit(built.rows(name), generator=generator(0, 0, name))
+        quantizer.fit(built.scene.rows(name), generator=generator(0, 0, name))
     # Steps and ranks come from a trainer; there is none here.
     built._trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, max_steps=10)
     return built.train()
@@ -78,7 +67,7 @@ def test_quantizing_renders_the_visible_splats_with_noise_of_the_right_length(
         seen.append(splats)
         return render(splats, view, **settings)
 
-    monkeypatch.setattr("nsvq_lightning.training.scene_module.render", spy)
+    monkeypatch.setattr("nsvq_lightning.training.splat_scene.render", spy)
     module.phase = Phase.QUANTIZE
     module(camera())
     rows = visible(module.splats.raw(), camera())
@@ -87,7 +76,7 @@ def test_quantizing_renders_the_visible_splats_with_noise_of_the_right_length(
     assert torch.equal(used.means, module.splats.means[rows])
     assert torch.equal(used.opacities, module.splats.opacities[rows])
     for name, quantizer in module.quantizers.items():
-        raw = module.rows(name)[rows]
+        raw = module.scene.rows(name)[rows]
         hard = quantizer.decode(quantizer.encode(raw)).detach()
         moved = (getattr(used, name).detach().reshape(len(rows), -1) - raw).norm(dim=1)
         torch.testing.assert_close(moved, (hard - raw).norm(dim=1), rtol=1e-4, atol=1e-5)
@@ -102,15 +91,15 @@ def test_evaluation_in_the_quantize_phase_uses_hard_codes(module: SplatModule) -
     expected = render(module.compressed().decode(), camera(), sh_degree=1)
     assert torch.equal(module(camera()).image, expected.image)
     assert all(int(quantizer.window) == 0 for quantizer in module.quantizers.values())
-    hard = module.hard_splats(Phase.QUANTIZE)
+    hard = module.scene.hard_splats(Phase.QUANTIZE)
     assert torch.equal(render(hard, camera()).image, expected.image)
-    assert torch.equal(module.hard_splats(Phase.PRUNE).scales, module.splats.scales)
+    assert torch.equal(module.scene.hard_splats(Phase.PRUNE).scales, module.splats.scales)
 
 
 def test_fine_tuning_trains_codebooks_positions_and_opacities_only(module: SplatModule) -> None:
     module.phase = Phase.FINETUNE
     for name, quantizer in module.quantizers.items():
-        quantizer.freeze(quantizer.encode(module.rows(name)))
+        quantizer.freeze(quantizer.encode(module.scene.rows(name)))
     module(camera()).image.square().mean().backward()
     assert {name for name in ATTRIBUTES if getattr(module.splats, name).grad is not None} == {"means", "opacities"}
     assert all(quantizer.codebook.grad is not None for quantizer in module.quantizers.values())
@@ -123,7 +112,7 @@ def test_random_backgrounds_change_with_the_step_and_not_in_evaluation(module: S
     random = SplatModule(sh_degree=1, codebooks=None, background="random", splats=make_splats())
     random._trainer = module._trainer
     first = random.train()(camera()).image
-    random._micro_batch = 1
+    random._view_of_step = 1
     assert not torch.equal(first, random(camera()).image)
     assert torch.equal(random.eval()(camera()).image, module(camera()).image)  # black
     assert float(random(camera()).image[0, 0].detach().min()) >= 0.0
@@ -189,72 +178,7 @@ def test_a_trained_module_cannot_be_trained_from_the_start(module: SplatModule) 
         PhaseSchedule().on_train_start(module.trainer, module)
 
 
-def test_a_run_can_start_from_a_file(demo_scene: Path, tmp_path: Path) -> None:
-    start = make_splats()
-    save(start, tmp_path / "start.ply")
-    module = SplatModule(
-        sh_degree=1,
-        codebooks=None,
-        init_from=str(tmp_path / "start.ply"),
-        rates=LearningRates(means=1e-9, means_final=1e-9),
-    )
-    data = ColmapDataModule(str(demo_scene), factor=4)
-    fit(module, data, [PhaseSchedule()], 1)
-    means = torch.from_numpy(module.compressed().means)
-    torch.testing.assert_close(means, start.means.detach(), atol=1e-5, rtol=0)
-    assert module.active_sh_degree == 1
-    wrong = SplatModule(sh_degree=2, codebooks=None, init_from=str(tmp_path / "start.ply"))
-    with pytest.raises(ValueError, match="set sh_degree=1"):
-        fit(wrong, data, [PhaseSchedule()], 1)
-
-
 def test_trained_splats_are_rendered_with_all_their_coefficients() -> None:
     splats = Splats.from_points(torch.randn(5, 3), torch.rand(5, 3), 2)
     assert SplatModule(splats=splats).active_sh_degree == 2
     assert SplatModule(sh_degree=2).active_sh_degree == 0  # from points, the degree grows
-
-
-def test_a_lone_point_before_the_cameras_does_not_hide_the_scene(make_scene: Callable[..., Path]) -> None:
-    data = ColmapDataModule(str(make_scene()))
-    scene = replace(data.scene, frame=Frame())
-    centres = torch.stack([scene.cameras[index].position for index in scene.train])
-    lone = centres[0] + torch.tensor([0.0, 0.0, 0.5])
-    points = torch.cat([lone[None], 1e3 + 0.01 * torch.arange(9.0).view(3, 3)])
-    data.scene = replace(scene, points=points, colors=torch.zeros(4, 3))
-    module = SplatModule(sh_degree=0)
-    module.trainer = SimpleNamespace(datamodule=data)  # type: ignore[assignment]
-    free = first_splats(module)
-    module.first_points = 4
-    capped = first_splats(module)
-    nearest = torch.cdist(capped.means, centres).min(1).values
-    pixels = capped.scales.exp()[:, 0] / nearest * scene.cameras[0].intrinsics[0]
-    assert float(pixels[0]) == pytest.approx(50.0, rel=1e-4)
-    assert torch.equal(capped.scales[1:], free.scales[1:])
-    assert capped.opacities.sigmoid().tolist() == pytest.approx([0.3] * 4)
-
-
-def test_photos_from_one_place_are_named(make_scene: Callable[..., Path]) -> None:
-    module, data = SplatModule(), ColmapDataModule(str(make_scene()))
-    data.scene = replace(data.scene, extent=0.0)
-    trainer = Trainer(max_steps=1, logger=False, enable_checkpointing=False, enable_progress_bar=False)
-    with pytest.raises(ValueError, match=r"the 9 photos of .* are taken from one place.* move while"):
-        trainer.fit(module, data)
-
-
-def test_before_the_codebooks_everything_is_stored_as_it_is(caplog: pytest.LogCaptureFixture) -> None:
-    module = SplatModule(codebooks="0.5k", splats=make_splats())
-    stored = module.compressed()
-    assert "unquantized" in caplog.text
-    assert not stored.codes
-    decoded = stored.decode()
-    for name in ATTRIBUTES:
-        assert torch.equal(getattr(decoded, name), getattr(module.splats, name)), name
-
-
-def test_the_sizes_of_codebooks_that_storing_places_are_those_that_it_placed() -> None:
-    module = SplatModule(codebooks={"scales": 4096, "sh0": 8}, quantizer=PostHoc, splats=make_splats())
-    module.phase = Phase.QUANTIZE
-    for _ in range(2):
-        stored = module.compressed()
-        assert stored.config["codebooks"] == {"scales": 30, "sh0": 8}
-        assert {name: len(rows) for name, rows in stored.codebooks.items()} == stored.config["codebooks"]

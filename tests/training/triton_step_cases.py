@@ -101,9 +101,9 @@ def module_and_view(phase: Phase) -> tuple[SplatModule, View]:
     module = SplatModule(sh_degree=3, quantizer=NSVQ, codebooks=codes, splats=splats)
     module.backend, module.active_sh_degree, module.phase = "cuda", 3, phase
     for name, quantizer in module.quantizers.items():
-        quantizer.fit(module.rows(name), generator=generator(0, 0, name))
+        quantizer.fit(module.scene.rows(name), generator=generator(0, 0, name))
         if phase is Phase.FINETUNE:
-            quantizer.freeze(quantizer.encode(module.rows(name)))
+            quantizer.freeze(quantizer.encode(module.scene.rows(name)))
     module._trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, max_steps=1000)
     viewmat = torch.eye(4)
     viewmat[2, 3] = 3.0

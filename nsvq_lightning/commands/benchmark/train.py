@@ -167,8 +167,8 @@ def run(scope: Scope) -> Iterator[timing.Measurement]:
 @torch.no_grad()
 def _test_psnr(module: SplatModule) -> float:
     data: ColmapDataModule = module.trainer.datamodule  # type: ignore[attr-defined]  # Lightning does not type it
-    splats, views = module.hard_splats(module.phase), data.test_dataloader()
-    return evaluate(lambda camera: module.render_splats(splats, camera).image, views, module.device)[0]
+    splats, views = module.scene.hard_splats(module.phase), data.test_dataloader()
+    return evaluate(lambda camera: module.scene.render(splats, camera).image, views, module.device)[0]
 
 
 def different_numbers(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> int:

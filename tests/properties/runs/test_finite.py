@@ -33,7 +33,8 @@ def search(quantizer: Any, iteration: int, updated: bool = True, every: int = 10
     state = {key: torch.ones_like(quantizer.codebook) for key in ("exp_avg", "exp_avg_sq")}
     optimizer = SimpleNamespace(param_groups=[group], state={quantizer.codebook: state})
     trainer: Any = SimpleNamespace(global_step=iteration, optimizers=[optimizer])
-    host: Any = SimpleNamespace(schedule=Schedule(), quantizers={"scales": quantizer}, rows=lambda name: ROWS, seed=0)
+    trained = SimpleNamespace(rows=lambda name: ROWS)
+    host: Any = SimpleNamespace(schedule=Schedule(), quantizers={"scales": quantizer}, scene=trained, seed=0)
     FiniteCodes(every).on_train_batch_end(trainer, host, {}, None, 0)
     return state
 

@@ -9,7 +9,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import Recipe, RunFactory, Whole
 
 from nsvq_lightning.callbacks import DensityControl
-from nsvq_lightning.training.scene_module import train_contributions
+from nsvq_lightning.training.run_scene import train_contributions
 
 
 class Counts(Callback):
@@ -36,7 +36,7 @@ def test_no_iteration_has_more(run: RunFactory, recipe: Recipe) -> None:
 
 def test_what_stays_is_what_the_photos_see(run: RunFactory, recipe: Recipe) -> None:
     trainer, everything = run(recipe(density=limited(None)).values(), max_steps=1, module={"rates": {"means": 1e-12}})
-    contribution = train_contributions(trainer, everything)
+    contribution = train_contributions(trainer, everything.scene)
     expected = everything.splats.means[contribution.argsort(descending=True)[:50]]
     _, few = run(recipe(density=limited(50)).values(), max_steps=1, module={"rates": {"means": 1e-12}})
     same = (few.splats.means[:, None] - expected[None]).abs().amax(2).amin(1) < 1e-4

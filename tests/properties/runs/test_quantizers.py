@@ -99,7 +99,7 @@ def test_the_file_holds_the_frozen_codes_and_the_fine_tuned_codebooks(finished: 
         assert np.array_equal(stored.codes[name], quantizer.codes.numpy())
         assert np.array_equal(stored.codebooks[name], in_files(module, name, quantizer.codebook))
         # Raw attributes stand still in fine-tuning; codes are the nearest ones of its start.
-        rows, book = module.rows(name), books.at[QUANTIZE_END][name]
+        rows, book = module.scene.rows(name), books.at[QUANTIZE_END][name]
         assert_nearest(quantizer.codes, rows, kmeans(rows, len(book), generator(0)) if kind is PostHoc else book)
         assert not torch.equal(books.at[QUANTIZE_END + 1][name], books.at[STEPS][name])
 
@@ -150,7 +150,7 @@ def test_post_hoc_stores_kmeans_of_the_final_rows(run: RunFactory, recipe: Recip
     assert module.phase is Phase.QUANTIZE
     stored = read_nsvq(scene_path(trainer))
     for name, quantizer in module.quantizers.items():
-        rows = module.rows(name)
+        rows = module.scene.rows(name)
         expected = kmeans(rows, quantizer.codebook.shape[0], generator(0))
         assert np.array_equal(stored.codebooks[name], in_files(module, name, expected))
         assert_nearest(torch.from_numpy(stored.codes[name].astype(np.int64)), rows, expected)

@@ -122,7 +122,7 @@ def test_where_flow_finds_nothing_the_run_starts_from_sfm(
     run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nothing = torch.empty(0, 3)
-    monkeypatch.setattr("nsvq_lightning.training.scene_module.dense_points", lambda *_: (nothing, nothing))
+    monkeypatch.setattr("nsvq_lightning.training.run_scene.dense_points", lambda *_: (nothing, nothing))
     _, module = run(recipe(budget=SplatBudget(splats=2000), density=None).values(), max_steps=1)
     assert len(module.splats) > 0
     assert "training starts from SfM's points" in caplog.text
@@ -134,7 +134,7 @@ def test_a_resumed_run_looks_for_no_points(
     def refuse(*_: object) -> None:
         raise AssertionError("the checkpoint has its splats")
 
-    monkeypatch.setattr("nsvq_lightning.training.scene_module.dense_points", refuse)
+    monkeypatch.setattr("nsvq_lightning.training.run_scene.dense_points", refuse)
     checkpoint = sorted((fast.folder / "checkpoints").glob("*.ckpt"))[0]
     run(recipe(**recipe_options()).values(), ckpt_path=checkpoint, module=RECIPE_MODULE)
 

@@ -1,0 +1,168 @@
+"""What a run takes from its scene: extent, background, first splats, how much each splat shows in the train views."""
+
+import logging
+import time
+from collections.abc import Iterator
+from typing import cast
+
+import torch
+from lightning.pytorch import Trainer
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from nsvq_lightning.compression.importance import contributions, sensitivity
+from nsvq_lightning.data.dense_start import dense_points
+from nsvq_lightning.data.scene import ONE_PLACE, Scene, View
+from nsvq_lightning.io.formats import read_scene
+from nsvq_lightning.random import generator
+from nsvq_lightning.rendering.frame import EXTENT, Frame
+from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors
+from nsvq_lightning.training.distributed import sum_over_processes
+from nsvq_lightning.training.splat_scene import SplatScene
+
+log = logging.getLogger(__name__)
+
+# First splats of a run with a budget (docs/recipe.md): opacity; largest size in pixels of the nearest photo, as a lone
+# point would hide what is behind it.
+FIRST_OPACITY, MAX_PIXELS = 0.3, 50.0
+
+
+def scene_of(trainer: Trainer | None) -> Scene | None:
+    """The scene of the trainer's data module; None if it has none."""
+    return cast("Scene | None", getattr(getattr(trainer, "datamodule", None), "scene", None))
+
+
+def needed_scene(trainer: Trainer, need: str, otherwise: str) -> Scene:
+    """The scene of the trainer's data module.
+
+    Args:
+        trainer: The trainer.
+        need: What needs it, for the error.
+        otherwise: What to do where there is none.
+
+    Raises:
+        ValueError: The trainer has no data module with a scene.
+    """
+    scene = scene_of(trainer)
+    if scene is None:
+        raise ValueError(f"{need}: fit with a data module that has a scene, or {otherwise}")
+    return scene
+
+
+def train_contributions(trainer: Trainer, trained: SplatScene) -> Tensor:
+    """Blending weight ``[N]`` of each splat in all train views (:mod:`nsvq_lightning.compression.importance`).
+
+    Raises:
+        ValueError: The trainer has no data module with a scene.
+    """
+    need = "contributions of splats need the train views"
+    scene = needed_scene(trainer, need, "leave weights by contribution off")
+    cameras = (scene.cameras[index] for index in scene.train[trainer.global_rank :: trainer.world_size])
+    return sum_over_processes(trainer, contributions(trained.splats, cameras, trained.render))
+
+
+def train_sensitivities(
+    trainer: Trainer, trained: SplatScene, seed: int, splats: SplatTensors, most: int
+) -> Iterator[tuple[View, RawSplats, Tensor]]:
+    """How much the numbers of splats show in the train views: each view, its estimate and its picture.
+
+    See :func:`nsvq_lightning.compression.importance.sensitivity`.
+
+    Args:
+        trainer: The trainer; several processes share the views.
+        trained: Renders the splats.
+        seed: Seed of the run.
+        splats: Raw attributes.
+        most: Most views to render.
+
+    Raises:
+        ValueError: The trainer has no data module with a scene.
+    """
+    need = "what shows of splats is seen in the train views"
+    scene = needed_scene(trainer, need, "leave out the callbacks that ask (selection, rate_distortion)")
+    for index in scene.some_train(most)[trainer.global_rank :: trainer.world_size]:
+        view = scene.view(index).to(splats.means.device)
+        signs = generator(seed, trainer.global_step, "signs", index)
+        yield view, *sensitivity(splats, view.camera, trained.render, signs, view.mask)
+
+
+def extent_of(trainer: Trainer) -> float:
+    """Extent of the trainer's scene in its frame, above 0.
+
+    Raises:
+        ValueError: There is no scene, or all its cameras are in one place.
+    """
+    scene = needed_scene(trainer, "the extent of the scene is unknown", "set the module's extent")
+    if scene.extent <= 0.0:
+        raise ValueError(f"the {len(scene)} photos of {scene.root} {ONE_PLACE}")
+    return EXTENT
+
+
+def splats_of_file(path: str, frame: Frame, sh_degree: int) -> Splats:
+    """The splats of a scene file of any format in a frame, without non-finite ones.
+
+    Raises:
+        ValueError: They have another SH degree.
+    """
+    scene = read_scene(path).relative_to(frame.origin)
+    if scene.sh_degree != sh_degree:
+        raise ValueError(
+            f"{path} has SH degree {scene.sh_degree}, the module has {sh_degree}; set sh_degree={scene.sh_degree}"
+        )
+    return Splats.from_tensors(*frame.splats(scene.decode()))
+
+
+def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int) -> Splats:
+    """A splat for each point of the trainer's scene, in its frame.
+
+    Args:
+        trainer: The trainer.
+        sh_degree: Of the splats, whose higher coefficients are 0.
+        count: How many points, of SfM and, where these are fewer, of :mod:`nsvq_lightning.data.dense_start`; None for
+            those of SfM, as in 3DGS.
+        seed: Of the dense start.
+
+    Raises:
+        ValueError: The trainer has no data module with a scene.
+        SceneError: A photo cannot be decoded.
+    """
+    scene = needed_scene(trainer, "no splats to start from", "set init_from").standard
+    if count is None:
+        return Splats.from_points(scene.points, scene.colors, sh_degree)
+    points, colors = _with_dense_points(scene, count - len(scene.points), seed)
+    splats = Splats.from_points(points, colors, sh_degree, FIRST_OPACITY)
+    cameras = [scene.cameras[index] for index in scene.train]
+    distances, _ = cKDTree([camera.packed_view[12:] for camera in cameras]).query(splats.means.detach())
+    pixel = torch.from_numpy(distances).float() / max(camera.intrinsics[0] for camera in cameras)
+    splats.scales.data.clamp_(max=(MAX_PIXELS * pixel).log()[:, None])
+    return splats
+
+
+def _with_dense_points(scene: Scene, missing: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Positions and colours ``[P, 3]`` of the points of SfM and of so many more."""
+    if missing <= 0:
+        return scene.points, scene.colors
+    log.info("dense start: looking for %d points that neighbouring photos show, beside those of SfM", missing)
+    start = time.perf_counter()
+    points, colors = dense_points(scene, missing, seed)
+    seconds = time.perf_counter() - start
+    log.info("dense start: %d points beside %d of SfM, %.1f s", len(points), len(scene.points), seconds)
+    if len(points) == 0:
+        log.warning("neighbouring photos show nothing that could be followed: training starts from SfM's points")
+    return torch.cat([scene.points, points]), torch.cat([scene.colors, colors])
+
+
+def background_of(scene: Scene, asked: str) -> str:
+    """What the photos have behind their objects, for ``asked="auto"``; otherwise ``asked``.
+
+    Raises:
+        ValueError: The photos are shown on white, and another background was asked for.
+    """
+    if scene.white and asked not in ("auto", "white"):
+        raise ValueError(
+            f"the photos of {scene.root} are transparent around their objects and are shown on white, "
+            f"model.background is {asked}: leave it at auto"
+        )
+    if asked != "auto":
+        return asked
+    return "white" if scene.white else "black"

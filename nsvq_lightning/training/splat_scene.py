@@ -1,0 +1,99 @@
+"""What a run has made of its scene so far: splats and codebooks, how they are rendered, and how they are stored."""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nsvq_lightning.compression.stored import to_compressed
+from nsvq_lightning.io.compressed import CompressedScene, placed
+from nsvq_lightning.quantize.attributes import attribute_rows, decoded
+from nsvq_lightning.quantize.codebook import Quantizer
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.frame import Frame
+from nsvq_lightning.rendering.rasterize import Render, render
+from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, detached, sh_degree_of
+from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.version import __version__
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class SplatScene:
+    """Splats in training, the codebooks that store them, and the settings that they are rendered with."""
+
+    splats: Splats
+    """The splats, in :attr:`frame`."""
+    quantizers: Mapping[str, Quantizer]
+    """Quantizer by attribute; empty for a run without quantization."""
+    frame: Frame
+    """Coordinates of the splats. Cameras that the scene is given, and files made of it, have those of the files."""
+    sh_degree: int
+    """Degree that is rendered; higher coefficients are ignored."""
+    background: str
+    """Behind the splats; ``random`` is black here."""
+    antialiased: bool
+    backend: str
+    """Rasterizer, see :func:`nsvq_lightning.render`."""
+
+    def rows(self, attribute: str) -> Tensor:
+        """Rows ``[N, D]`` of a quantized attribute, detached."""
+        return attribute_rows(self.splats.raw(), attribute)
+
+    @torch.no_grad()
+    def hard_splats(self, phase: Phase) -> RawSplats:
+        """The splats as a file written in ``phase`` would hold them, detached: hard codes from ``QUANTIZE`` on.
+
+        They are still in :attr:`frame`.
+        """
+        raw = detached(self.splats)
+        return decoded(raw, self.quantizers) if phase >= Phase.QUANTIZE else raw
+
+    def render(self, splats: SplatTensors, camera: Camera, **options: Any) -> Render:
+        """Render any splats as the scene's own.
+
+        Args:
+            splats: Raw attributes, in :attr:`frame`.
+            camera: Where to look from, in the coordinates of the files.
+            **options: Arguments of :func:`nsvq_lightning.render` that replace the scene's.
+        """
+        own = {
+            "sh_degree": min(self.sh_degree, sh_degree_of(splats.shN)),
+            "background": splats.means.new_ones(3) if self.background == "white" else None,
+            "antialiased": self.antialiased,
+            "backend": self.backend,
+        }
+        return render(splats, self.frame.camera(camera), **(own | options))
+
+    def compressed(self, phase: Phase, settings: Mapping[str, Any]) -> CompressedScene:
+        """The scene as it is stored: frozen or nearest codes, codebooks, positions, opacities and the settings.
+
+        Before the quantize phase there are no codebooks yet, and everything is stored as it is.
+
+        Args:
+            phase: Phase of the run.
+            settings: What else of the run the file tells; nothing that differs between two runs with the same seed.
+
+        Raises:
+            ValueError: There are no splats.
+        """
+        if len(self.splats) == 0:
+            raise ValueError("there are no splats to store or to measure: pass the checkpoint of a run (--ckpt_path)")
+        quantizers = self.quantizers if phase >= Phase.QUANTIZE else {}
+        if self.quantizers and not quantizers:
+            log.warning("the %s phase has no codebooks yet: the scene is stored unquantized", phase.name.lower())
+        scene = to_compressed(self.splats.raw(), quantizers)  # PostHoc fits its codebooks only now
+        told = {
+            "version": __version__,
+            "codebooks": {name: int(quantizer.codebook.shape[0]) for name, quantizer in quantizers.items()},
+            "quantizers": {name: type(quantizer).__name__ for name, quantizer in quantizers.items()},
+            "background": self.background,
+            **settings,
+        }
+        if self.antialiased:
+            told["antialiased"] = True
+        return placed(replace(scene, config=told), self.frame)

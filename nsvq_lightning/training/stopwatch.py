@@ -1,0 +1,72 @@
+"""What a run spends its time on: training, without pauses and the compilation of kernels, and all else."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from nsvq_lightning.compute.jit import compile_seconds
+
+
+class Stopwatch:
+    """Adds the time between two laps to :attr:`seconds`, without pauses and the compilation of kernels."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        """Seconds spent training, over all resumed parts of the run."""
+        self._since: float | None = None
+
+    def start(self) -> None:
+        """Start counting now; earlier time is forgotten."""
+        self._since = _working_time()
+
+    def lap(self) -> None:
+        """Add the time since the last lap; does nothing if the watch is not running."""
+        if self._since is not None:
+            now = _working_time()
+            self.seconds += now - self._since
+            self._since = now
+
+    def stop(self) -> None:
+        """Add the time since the last lap and stop."""
+        self.lap()
+        self._since = None
+
+    @contextmanager
+    def paused(self, device: torch.device) -> Iterator[None]:
+        """Leave out the time of the body. Work already queued on ``device`` still counts as training."""
+        running = self._since is not None
+        if running:
+            torch.get_device_module(device).synchronize()
+            self.stop()
+        try:
+            yield
+        finally:
+            if running:
+                torch.get_device_module(device).synchronize()
+                self.start()
+
+
+class TimesBeside:
+    """Seconds that went into anything but training steps, by what it was."""
+
+    def __init__(self) -> None:
+        self._compiled_before = compile_seconds()
+        self._seconds: dict[str, float] = {}
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        """Add the time of the body to a part."""
+        start = time.perf_counter()
+        yield
+        self._seconds[part] = self._seconds.get(part, 0.0) + time.perf_counter() - start
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds by part, and those in which kernels were compiled."""
+        return {"kernels compiled": compile_seconds() - self._compiled_before, **self._seconds}
+
+
+def _working_time() -> float:
+    """Seconds on a clock that stops while kernels are compiled."""
+    return time.perf_counter() - compile_seconds()

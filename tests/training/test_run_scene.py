@@ -1,0 +1,101 @@
+"""What a run takes from its photos: extent, background, and first splats that do not hide what is behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from lightning.pytorch import Trainer
+from runs import fit
+from splat_scenes import random_splats
+
+from nsvq_lightning.callbacks import PhaseSchedule
+from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.io.formats import save
+from nsvq_lightning.rendering.frame import EXTENT, Frame
+from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.optim import LearningRates
+from nsvq_lightning.training.run_scene import background_of, extent_of, first_splats, needed_scene, scene_of
+
+
+def trainer_of(data: ColmapDataModule | None) -> Any:
+    return SimpleNamespace(datamodule=data)
+
+
+def test_who_needs_a_scene_says_what_for_and_what_to_do_without(make_scene: Callable[..., Path]) -> None:
+    data = ColmapDataModule(str(make_scene()))
+    assert scene_of(trainer_of(data)) is data.scene
+    assert scene_of(None) is scene_of(trainer_of(None)) is None
+    assert needed_scene(trainer_of(data), "a test needs photos", "skip it") is data.scene
+    with pytest.raises(ValueError, match="a test needs photos: fit with a data module that has a scene, or skip it"):
+        needed_scene(trainer_of(None), "a test needs photos", "skip it")
+
+
+def test_cameras_of_any_unit_have_the_extent_of_a_frame(make_scene: Callable[..., Path]) -> None:
+    assert extent_of(trainer_of(ColmapDataModule(str(make_scene())))) == EXTENT
+
+
+@pytest.mark.parametrize(
+    ("white", "asked", "found"),
+    [(False, "auto", "black"), (True, "auto", "white"), (True, "white", "white"), (False, "random", "random")],
+)
+def test_the_background_is_that_of_the_photos(white: bool, asked: str, found: str) -> None:
+    scene: Any = SimpleNamespace(white=white, root="lego")
+    assert background_of(scene, asked) == found
+
+
+def test_transparent_photos_are_not_trained_on_black() -> None:
+    scene: Any = SimpleNamespace(white=True, root="lego")
+    for asked in ("black", "random"):
+        with pytest.raises(ValueError, match=f"lego are transparent .* model.background is {asked}: leave it at auto"):
+            background_of(scene, asked)
+
+
+def test_a_lone_point_before_the_cameras_does_not_hide_the_scene(make_scene: Callable[..., Path]) -> None:
+    data = ColmapDataModule(str(make_scene()))
+    scene = replace(data.scene, frame=Frame())
+    centres = torch.stack([scene.cameras[index].position for index in scene.train])
+    lone = centres[0] + torch.tensor([0.0, 0.0, 0.5])
+    points = torch.cat([lone[None], 1e3 + 0.01 * torch.arange(9.0).view(3, 3)])
+    data.scene = replace(scene, points=points, colors=torch.zeros(4, 3))
+    trainer: Any = SimpleNamespace(datamodule=data)
+    free = first_splats(trainer, 0, None, 0)
+    capped = first_splats(trainer, 0, 4, 0)
+    nearest = torch.cdist(capped.means, centres).min(1).values
+    pixels = capped.scales.exp()[:, 0] / nearest * scene.cameras[0].intrinsics[0]
+    assert float(pixels[0]) == pytest.approx(50.0, rel=1e-4)
+    assert torch.equal(capped.scales[1:], free.scales[1:])
+    assert capped.opacities.sigmoid().tolist() == pytest.approx([0.3] * 4)
+
+
+def test_photos_from_one_place_are_named(make_scene: Callable[..., Path]) -> None:
+    module, data = SplatModule(), ColmapDataModule(str(make_scene()))
+    data.scene = replace(data.scene, extent=0.0)
+    trainer = Trainer(max_steps=1, logger=False, enable_checkpointing=False, enable_progress_bar=False)
+    with pytest.raises(ValueError, match=r"the 9 photos of .* are taken from one place.* move while"):
+        trainer.fit(module, data)
+
+
+def test_a_run_can_start_from_a_file(demo_scene: Path, tmp_path: Path) -> None:
+    start = Splats.from_tensors(*random_splats(30, sh_degree=1))
+    save(start, tmp_path / "start.ply")
+    module = SplatModule(
+        sh_degree=1,
+        codebooks=None,
+        init_from=str(tmp_path / "start.ply"),
+        rates=LearningRates(means=1e-9, means_final=1e-9),
+    )
+    data = ColmapDataModule(str(demo_scene), factor=4)
+    fit(module, data, [PhaseSchedule()], 1)
+    means = torch.from_numpy(module.compressed().means)
+    torch.testing.assert_close(means, start.means.detach(), atol=1e-5, rtol=0)
+    assert module.active_sh_degree == 1
+    wrong = SplatModule(sh_degree=2, codebooks=None, init_from=str(tmp_path / "start.ply"))
+    with pytest.raises(ValueError, match="set sh_degree=1"):
+        fit(wrong, data, [PhaseSchedule()], 1)
