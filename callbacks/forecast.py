@@ -11,7 +11,7 @@ from nsvq_lightning.data.scene import Scene, View, detailed_pixels
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.splats.splats import RawSplats, Splats, detached
 from nsvq_lightning.training import optim, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Schedule
@@ -58,16 +58,21 @@ def grown(scene: Scene, count: int) -> Splats:
         scene: In its frame.
         count: Number of splats.
     """
-    start = Splats.from_points(scene.points, scene.colors)
-    copies, draw = -(-count // len(start)), generator(0, 0, "forecast")
-    rows = torch.arange(len(start)).repeat(copies)[: max(count, len(start))]
-    tensors = {name: value.detach()[rows] for name, value in start.attributes().items()}
-    tensors["means"] = tensors["means"] + tensors["scales"].exp() * torch.randn(len(rows), 3, generator=draw)
+    start = detached(Splats.from_points(scene.points, scene.colors))
+    points = len(start.means)
+    copies = math.ceil(count / points)
+    rows = torch.arange(points).repeat(copies)[: max(count, points)]
+    copied = RawSplats(*(values[rows] for values in start))
+    draw = generator(0, 0, "forecast")
+    shifts = copied.scales.exp() * torch.randn(len(rows), 3, generator=draw)
     # More splats cover the surfaces with smaller ones, and trained ones overlap in many layers. With these two numbers,
     # renders of fox, bonsai and photos of two megapixels take about as long as those of the trained scenes.
-    tensors["scales"] = tensors["scales"] - math.log(copies) / 2 + 0.5
-    tensors["opacities"] = torch.randn(len(rows), generator=draw) - 0.5
-    return Splats.from_tensors(**tensors)
+    shrunk = copied._replace(
+        means=copied.means + shifts,
+        scales=copied.scales - math.log(copies) / 2 + 0.5,
+        opacities=torch.randn(len(rows), generator=draw) - 0.5,
+    )
+    return Splats.from_tensors(*shrunk)
 
 
 # Splats of the paper's density control, on average over its run, as a multiple of the default for the photos.
@@ -93,9 +98,14 @@ def iterations_within(minutes: float, trainer: Trainer, module: SplatModule, sch
     """
     scene = run_scene.needed_scene(trainer, "minutes are measured on the photos", "give trainer.max_steps")
     budget = module.splat_budget
-    if module.stretches is None or budget is None:
-        parts = [(1.0, budget or round(PAPER_SPLATS * splats_for_photos(len(scene.train), detailed_pixels(scene))))]
+    if budget is None:
+        usual = splats_for_photos(len(scene.train), detailed_pixels(scene))
+        parts = [(1.0, round(PAPER_SPLATS * usual))]
+    elif module.stretches is None:
+        parts = [(1.0, budget)]
     else:
-        parts = module.stretches(schedule, max(len(scene.points), module.first_points or 0), budget)
+        first = max(len(scene.points), module.first_points or 0)
+        parts = module.stretches(schedule, first, budget)
     seconds = trainer.accumulate_grad_batches * iteration_seconds(scene, parts, trainer.strategy.root_device)
-    return int(trainer.strategy.broadcast(max(1, round(60 * minutes / seconds))))
+    iterations = max(1, round(60 * minutes / seconds))
+    return int(trainer.strategy.broadcast(iterations))
