@@ -3,6 +3,8 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import and_
 from typing import Any, TypeVar
 
 import numpy as np
@@ -57,8 +59,11 @@ def codebook_bits(codebooks: Mapping[str, Sequence[int]]) -> tuple[float, float]
     Args:
         codebooks: Codes and dimension of each codebook by attribute.
     """
-    books = sum(codes * dim * ATTRIBUTES[name].code_bits for name, (codes, dim) in codebooks.items())
-    return books, sum(math.log2(codes) + ATTRIBUTES[name].row_bits for name, (codes, _) in codebooks.items())
+    books = splat = 0.0
+    for name, (codes, dim) in codebooks.items():
+        books += codes * dim * ATTRIBUTES[name].code_bits
+        splat += math.log2(codes) + ATTRIBUTES[name].row_bits
+    return books, splat
 
 
 def attribute_shapes(sh_degree: int) -> dict[str, tuple[int, ...]]:
@@ -76,7 +81,7 @@ def attribute_dims(sh_degree: int) -> dict[str, int]:
 
 
 # NumPy arrays, or torch tensors on any device; torch is not imported for the former.
-_Array = TypeVar("_Array")
+_Array = TypeVar("_Array", bound=Any)
 
 
 def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int]]:
@@ -88,16 +93,12 @@ def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int
     Returns:
         A boolean mask ``[N]`` and, for each attribute with non-finite rows, how many it has.
     """
-    mask: Any = None
-    culprits: dict[str, int] = {}
+    masks: dict[str, Any] = {}
     for name, values in attributes.items():
-        array: Any = values
-        flags = np.isfinite(array) if isinstance(array, np.ndarray) else array.isfinite()
-        good = flags.reshape(len(array), math.prod(array.shape[1:])).all(1)
-        mask = good if mask is None else mask & good
-        if bad := len(array) - int(good.sum()):
-            culprits[name] = bad
-    return mask, culprits
+        finite = np.isfinite(values) if isinstance(values, np.ndarray) else values.isfinite()
+        masks[name] = finite.reshape(len(values), math.prod(values.shape[1:])).all(1)
+    culprits = {name: len(mask) - int(mask.sum()) for name, mask in masks.items() if not mask.all()}
+    return reduce(and_, masks.values()), culprits
 
 
 def listed(culprits: Mapping[str, int]) -> str:
@@ -105,7 +106,7 @@ def listed(culprits: Mapping[str, int]) -> str:
     return ", ".join(f"{name} in {count} rows" for name, count in culprits.items())
 
 
-def dropped(mask: Any, culprits: Mapping[str, int]) -> str:
+def dropped(mask: _Array, culprits: Mapping[str, int]) -> str:
     """The warning about rows that are left out, from both results of :func:`finite_rows`."""
     return f"dropped {int((~mask).sum())} of {len(mask)} splats with non-finite values: {listed(culprits)}"
 
