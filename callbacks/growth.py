@@ -31,6 +31,9 @@ from .settings import ABOVE_0, AT_LEAST_1, Count, NonNegative, Opacity, Positive
 
 log = logging.getLogger(__name__)
 
+# Fewest splats of a scene.
+MIN_BUDGET = 1000
+
 
 @dataclass(eq=False)
 class SplatBudget(SplatCallback):
@@ -296,10 +299,6 @@ class BudgetedGrowth(Densification):
         divided = draw_rows(candidates, room, generator(module.seed, iteration, "grow"))
         parents = RawSplats(*(tensor.detach()[divided] for tensor in splats.raw()))
         return room, self.divide(trainer, module, divided, split_longest(parents))
-
-
-# Fewest splats of a scene.
-MIN_BUDGET = 1000
 
 
 def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:

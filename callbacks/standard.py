@@ -10,18 +10,6 @@ from nsvq_lightning.top_level import folder_of
 
 from . import checkpoint, growth, outputs, progress, pruning, quantization, report, schedule
 
-
-def _made(name: str, value: Any) -> Callback | None:
-    """What a config says of a callback: null, a class by name or with its settings, or settings of the standard one."""
-    if value is None:
-        return None
-    named: dict[str, Any] = {"class_path": value} if isinstance(value, str) else value
-    if "class_path" not in named:
-        return STANDARD[name](**named)
-    kind: type[Callback] = getattr(import_module(__package__), named["class_path"])
-    return kind(**named.get("init_args", {}))
-
-
 # Callback by name. The length of a run in minutes depends on the budget. Density control comes before the canonical
 # form, which may act after the same iteration; codebooks are placed, and codes replaced, before rate and distortion
 # choose among them.
@@ -47,6 +35,18 @@ STANDARD: dict[str, type[Callback]] = {
     "checkpoint": checkpoint.RunCheckpoint,
     "progress": progress.SplatProgressBar,
 }
+
+
+def _made(name: str, value: Any) -> Callback | None:
+    """What a config says of a callback: null, a class by name or with its settings, or settings of the standard one."""
+    if value is None:
+        return None
+    named: dict[str, Any] = {"class_path": value} if isinstance(value, str) else value
+    if "class_path" not in named:
+        return STANDARD[name](**named)
+    kind: type[Callback] = getattr(import_module(__package__), named["class_path"])
+    return kind(**named.get("init_args", {}))
+
 
 # Those that a run has only if a config or the user asks for them.
 OPTIONAL = frozenset({"opacity", "codebook_refit", "rate_distortion"})

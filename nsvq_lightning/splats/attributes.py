@@ -11,6 +11,9 @@ import numpy as np
 
 from nsvq_lightning.splats.conventions import sh_coefficients
 
+# NumPy arrays, or torch tensors on any device; torch is not imported for the former.
+_Array = TypeVar("_Array", bound=Any)
+
 
 @dataclass(frozen=True)
 class Attribute:
@@ -78,10 +81,6 @@ def attribute_shapes(sh_degree: int) -> dict[str, tuple[int, ...]]:
 def attribute_dims(sh_degree: int) -> dict[str, int]:
     """Values per splat, D, by attribute; ``shN`` is the flattened ``[coefficients, 3]``."""
     return {name: math.prod(shape) for name, shape in attribute_shapes(sh_degree).items()}
-
-
-# NumPy arrays, or torch tensors on any device; torch is not imported for the former.
-_Array = TypeVar("_Array", bound=Any)
 
 
 def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int]]:

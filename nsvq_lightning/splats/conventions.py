@@ -18,6 +18,9 @@ Uint64s = NDArray[np.uint64]
 # Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh0.
 SH_C0 = 0.5 / math.sqrt(math.pi)
 
+# ``[4, 3]``: the components other than each one, ascending.
+_OTHERS = np.array([[j for j in range(4) if j != i] for i in range(4)])
+
 
 def sh_coefficients(degree: int) -> int:
     """Number of higher spherical-harmonic coefficients per colour channel, (degree + 1)² - 1.
@@ -60,10 +63,6 @@ def turned(quats: Float32s, rotation: Float64s) -> Float32s:
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()
     product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return np.asarray(quats.astype(np.float64) @ product.T, np.float32)
-
-
-# ``[4, 3]``: the components other than each one, ascending.
-_OTHERS = np.array([[j for j in range(4) if j != i] for i in range(4)])
 
 
 def smallest_three(units: Float64s) -> tuple[NDArray[np.intp], Float64s]:

@@ -15,6 +15,8 @@ from torch.distributed import all_reduce
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.version import check_replaced
 
+log = logging.getLogger(__name__)
+
 T = TypeVar("T")
 
 
@@ -111,9 +113,6 @@ def sum_over_processes(trainer: Trainer, tensor: Tensor) -> Tensor:
     if trainer.world_size > 1:
         all_reduce(tensor)  # not the strategy's reduction, which has a barrier
     return tensor
-
-
-log = logging.getLogger(__name__)
 
 
 # Without them, replicas would start apart, or gradients never be averaged.

@@ -11,6 +11,11 @@ from torch import Tensor, nn
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import Splats
 
+# Prefix of a codebook's parameter group, before the name of its attribute.
+CODEBOOK_PREFIX = "codebook_"
+# Adam's epsilon in 3D Gaussian splatting: gradients of a splat are far below PyTorch's default of 1e-8.
+EPS = 1e-15
+
 
 @dataclass(frozen=True)
 class LearningRates:
@@ -60,10 +65,6 @@ def position_lr(iteration: int, extent: float, rates: LearningRates, decay_end: 
     return extent * math.exp((1.0 - t) * math.log(rates.means) + t * math.log(rates.means_final))
 
 
-# Prefix of a codebook's parameter group, before the name of its attribute.
-CODEBOOK_PREFIX = "codebook_"
-
-
 def codebook_group(attribute: str) -> str:
     """Name of the parameter group of an attribute's codebook."""
     return f"{CODEBOOK_PREFIX}{attribute}"
@@ -98,10 +99,6 @@ def group_lr(name: str, rates: LearningRates, extent: float) -> float:
     if attribute != name:
         return rate * rates.codebook_factor
     return rate * extent if name == "means" else rate
-
-
-# Adam's epsilon in 3D Gaussian splatting: gradients of a splat are far below PyTorch's default of 1e-8.
-EPS = 1e-15
 
 
 def adapt_to_views(optimizer: torch.optim.Optimizer, rates: LearningRates, views: int) -> float:

@@ -24,6 +24,10 @@ from nsvq_lightning.training.schedule import Schedule
 
 log = logging.getLogger(__name__)
 
+# Key under which a checkpoint holds the class and number of codes that each quantizer was made with.
+QUANTIZER_SETTINGS = "quantizer_settings"
+WAY_OUT = "pass a checkpoint that nsvq fit has written, …/checkpoints/last.ckpt"
+
 
 def continued_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> Schedule:
     """The schedule with the iterations that the checkpoint's run has saved in the same warm-up phase."""
@@ -44,10 +48,6 @@ def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str |
         f"continues with {', '.join(f'{name} = {own[name]}' for name in changed)}; pass "
         f"{' '.join(f'{options[name]}={stored[name]}' for name in changed)} to continue that run as it was"
     )
-
-
-# Key under which a checkpoint holds the class and number of codes that each quantizer was made with.
-QUANTIZER_SETTINGS = "quantizer_settings"
 
 
 def check_continuation(
@@ -88,8 +88,6 @@ def _described(settings: Mapping[str, Mapping[str, Any]]) -> str:
 
 # Key under which a checkpoint holds which scene it is of.
 SCENE = "scene"
-
-WAY_OUT = "pass a checkpoint that nsvq fit has written, …/checkpoints/last.ckpt"
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:

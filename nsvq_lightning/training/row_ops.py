@@ -20,7 +20,11 @@ log = logging.getLogger(__name__)
 
 # Up to here (8e13 scene units) float32 holds the square of a splat's extent on the near plane of any camera; no view
 # shows larger splats, so nothing would ever train or prune them.
-LARGEST_LOG_SCALE = 32.0
+MAX_LOG_SCALE = 32.0
+
+FIRST_MOMENT = "exp_avg"
+# Per-row state of Adam; everything else in its state belongs to the whole parameter.
+MOMENTS = (FIRST_MOMENT, "exp_avg_sq", "max_exp_avg_sq")
 
 
 def append_rows(splats: Splats, optimizer: Optimizer, new: Mapping[str, Tensor]) -> None:
@@ -84,11 +88,6 @@ def replace_attribute(splats: Splats, optimizer: Optimizer, name: str, values: T
     _rebind(splats, optimizer, name, values.detach().to(parameter), lambda moment: moment)
 
 
-FIRST_MOMENT = "exp_avg"
-# Per-row state of Adam; everything else in its state belongs to the whole parameter.
-MOMENTS = (FIRST_MOMENT, "exp_avg_sq", "max_exp_avg_sq")
-
-
 def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: Tensor, maps: Tensor) -> None:
     """Overwrite all rows of one attribute with other coordinates of the same splats, and transform the moments.
 
@@ -124,13 +123,13 @@ def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -
 
 
 def trainable_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:
-    """Which splats are finite in every attribute and in projection (:data:`LARGEST_LOG_SCALE`).
+    """Which splats are finite in every attribute and in projection (:data:`MAX_LOG_SCALE`).
 
     Returns:
         A mask ``[N]`` (bool) and, for each attribute with non-finite rows, how many it has.
     """
     attributes = {name: parameter.detach() for name, parameter in splats.attributes().items()}
-    attributes["scales"] = attributes["scales"].masked_fill(attributes["scales"] > LARGEST_LOG_SCALE, torch.inf)
+    attributes["scales"] = attributes["scales"].masked_fill(attributes["scales"] > MAX_LOG_SCALE, torch.inf)
     return finite_rows(attributes)
 
 

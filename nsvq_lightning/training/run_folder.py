@@ -19,6 +19,11 @@ from nsvq_lightning.training.distributed import on_first_process
 _FOLDERS: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
 _RESERVED: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
 
+# File that names the process of a run and its machine, and the one that this process keeps locked.
+MARKER, LOCK = ".running", ".running.lock"
+# The lock of each folder that this process writes a run to.
+_HELD: dict[Path, FileLock] = {}
+
 
 def run_folder(trainer: Trainer) -> Path:
     """Folder of the trainer's run, which exists; the same one for everything that this trainer does.
@@ -88,13 +93,6 @@ def take(folder: Path, checkpoint: str | Path | None) -> None:
     log_file = folder / "metrics.csv"  # of Lightning's CSV logger, which removes an existing one
     if log_file.exists():
         log_file.rename(next(p for n in count(1) if not (p := folder / f"metrics_{n}.csv").exists()))
-
-
-# File that names the process of a run and its machine, and the one that this process keeps locked.
-MARKER, LOCK = ".running", ".running.lock"
-
-# The lock of each folder that this process writes a run to.
-_HELD: dict[Path, FileLock] = {}
 
 
 def hold(folder: Path) -> None:

@@ -16,7 +16,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats, Splats
-from nsvq_lightning.training.row_ops import LARGEST_LOG_SCALE, trainable_rows
+from nsvq_lightning.training.row_ops import MAX_LOG_SCALE, trainable_rows
 
 SCENES = extremes()
 COARSE = {"scene at 1e+03": 2e-3, "scene at 1e+06": 1.0}
@@ -99,7 +99,7 @@ def test_determinant_that_would_under_or_overflow(backend: str) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("log_scale", [LARGEST_LOG_SCALE + 1, 88.8, math.inf])
+@pytest.mark.parametrize("log_scale", [MAX_LOG_SCALE + 1, 88.8, math.inf])
 def test_inf_scale_is_named(log_scale: float, backend: str) -> None:
     """Sizes whose squares, or which themselves, are infinite in float32."""
     both = RawSplats(*map(torch.cat, zip(_one_splat(-2.0), _one_splat(log_scale), strict=True)))
@@ -111,7 +111,7 @@ def test_inf_scale_is_named(log_scale: float, backend: str) -> None:
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("log_scale", [18.0, 24.5, LARGEST_LOG_SCALE])
+@pytest.mark.parametrize("log_scale", [18.0, 24.5, MAX_LOG_SCALE])
 def test_the_largest_sizes_that_are_kept_train(log_scale: float, antialiased: bool) -> None:
     """On the near plane, where a splat covers most pixels; plain torch overflows there, and then drops the splat."""
     camera = SCENES["one splat"].workload.camera
