@@ -12,10 +12,11 @@ from lightning.pytorch.callbacks import BasePredictionWriter
 
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import optional
-from nsvq_lightning.io.compressed import CompressedScene, placed
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import FORMATS, save
 from nsvq_lightning.io.nsvq.file import as_stored
 from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.io.placing import placed
 from nsvq_lightning.report import files, viewer
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder

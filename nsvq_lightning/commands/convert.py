@@ -24,8 +24,8 @@ from tqdm import tqdm
 
 from nsvq_lightning.commands.arguments import views_of
 from nsvq_lightning.commands.compress import VIEWS, share_or_number, splats_left
-from nsvq_lightning.io import compressed, formats, lod, spz
-from nsvq_lightning.io.compressed import UP_AXES, CompressedScene
+from nsvq_lightning.io import formats, lod, placing, spz
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.describe import attribute_errors
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.sog import PALETTE_LIMIT
@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--sh-degree", type=int, choices=range(4), help=help_)
     turn = parser.add_mutually_exclusive_group().add_argument
     help_ = "turn the scene so that up, as the cameras of --data.root hold it, is this axis"
-    turn("--up", choices=UP_AXES, help=help_)
+    turn("--up", choices=placing.UP_AXES, help=help_)
     help_ = "turn, scale and move the scene: the upper three rows of a matrix, from old to new coordinates"
     turn("--matrix", nargs=12, type=float, metavar=("A", *"BCDEFGHIJKL"), help=help_)
     help_ = "move the scene so that the cameras of --data.root are where those of this scene folder are, by photo name"
@@ -105,7 +105,7 @@ def run(options: argparse.Namespace) -> int:
     entry = formats.format_of(output)
     if not output.parent.is_dir() and formats.suffix_of(output) != lod.NAME:
         raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
-    scene = _edited(compressed.joined([formats.read_scene(path) for path in options.inputs]), options)
+    scene = _edited(CompressedScene.joined([formats.read_scene(path) for path in options.inputs]), options)
     size = formats.save(scene, output, **writer)
     # What reading the output back would say of it is known here.
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
@@ -123,7 +123,7 @@ def _edited(scene: CompressedScene, options: argparse.Namespace) -> CompressedSc
     """The scene within the box, without floaters, thinned, turned and moved, up to a degree, in this order."""
     before = len(scene)
     if options.crop is not None:
-        scene = compressed.cropped(scene, np.array(options.crop[:3]), np.array(options.crop[3:]))
+        scene = scene.cropped(np.array(options.crop[:3]), np.array(options.crop[3:]))
         if len(scene) == 0:
             named = ", ".join(map(str, options.inputs))
             raise ValueError(f"no splat of {named} is in the box {' '.join(map(str, options.crop))}")
@@ -133,16 +133,16 @@ def _edited(scene: CompressedScene, options: argparse.Namespace) -> CompressedSc
     if (left := splats_left(options.splats, len(scene))) < len(scene):
         scene = _thinned(scene, left, options)
     if options.up is not None:
-        scene = compressed.rotated(scene, compressed.turn_up(_up(options), options.up))
+        scene = placing.rotated(scene, placing.turn_up(_up(options), options.up))
     if options.matrix is not None:
-        scene = compressed.moved(scene, np.array([*options.matrix, 0, 0, 0, 1]).reshape(4, 4))
+        scene = placing.moved(scene, np.array([*options.matrix, 0, 0, 0, 1]).reshape(4, 4))
     if options.align is not None:
         from nsvq_lightning.data.colmap import alignment
         from nsvq_lightning.data.transforms import read_poses
 
-        scene = compressed.moved(scene, alignment(*(read_poses(folder) for folder in (options.root, options.align))))
+        scene = placing.moved(scene, alignment(*(read_poses(folder) for folder in (options.root, options.align))))
     if options.sh_degree is not None and options.sh_degree < scene.sh_degree:
-        scene = compressed.with_degree(scene, options.sh_degree)
+        scene = scene.with_degree(options.sh_degree)
     return scene.in_use() if len(scene) < before else scene
 
 

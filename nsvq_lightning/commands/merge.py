@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> int:
 
     from nsvq_lightning.data.blocks import BLOCK, Block, near_seams, points_in_front, shown
     from nsvq_lightning.data.scene import load_scene
-    from nsvq_lightning.io.compressed import joined
+    from nsvq_lightning.io.compressed import CompressedScene
     from nsvq_lightning.io.formats import format_of, read_scene, save
     from nsvq_lightning.quality.metrics import eight_bit, psnr
     from nsvq_lightning.rendering.rasterize import render
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
         parts.append(part)
     photos = load_scene(blocks[0].scene)
     # Parts have the coordinates of the whole's files, whose origin only the whole knows.
-    scene = replace(joined(parts), origin=photos.frame.origin)
+    scene = replace(CompressedScene.joined(parts), origin=photos.frame.origin)
     size = save(scene, options.output)
     sys.stdout.write(f"{options.output}: {len(scene):,} splats in {size:,} bytes\n")
     splats = scene.decode()

@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt
 from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import write_bytes, write_text
-from nsvq_lightning.io.compressed import turn_up
+from nsvq_lightning.io.placing import turn_up
 from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.poses import up_of

@@ -1,7 +1,8 @@
-"""A scene as files hold it, some of whose attributes are codes; it is turned and cropped without decoding these."""
+"""A scene as files hold it: some of its attributes are codes, which most changes leave as they are."""
 
 import logging
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,10 +11,9 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.splats import attributes as splat
-from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, shN_degree, turned
+from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, shN_degree
 
 if TYPE_CHECKING:
-    from nsvq_lightning.rendering.frame import Frame
     from nsvq_lightning.splats.splats import Splats, SplatTensors
 
 log = logging.getLogger(__name__)
@@ -95,14 +95,73 @@ class CompressedScene:
 
         tensors = {name: getattr(splats, name).detach() for name in splat.ATTRIBUTES}
         check_shapes(tensors)
-        rows = {name: tensor.cpu().numpy().astype(np.float32) for name, tensor in tensors.items()}
-        dims = splat.attribute_dims(shN_degree(rows["shN"].shape[1]))
+        return cls.from_rows(
+            {name: tensor.cpu().numpy().astype(np.float32) for name, tensor in tensors.items()}, **header
+        )
+
+    @classmethod
+    def from_rows(cls, rows: Mapping[str, NDArray[Any]], antialiased: bool = False, **header: Any) -> "CompressedScene":
+        """N splats without any codebook, as most formats hold them.
+
+        Args:
+            rows: Attributes ``[N, ...]`` in numbers of any kind, which become float32; without ``shN``, colours do not
+                change with the view.
+            antialiased: Whether :attr:`config` says that it is to be rendered with anti-aliasing.
+            header: ``config``, ``metrics`` and ``origin``.
+
+        Raises:
+            ValueError: The shape of an attribute does not fit the others.
+        """
+        if antialiased:
+            header["config"] = {"antialiased": True}
+        found = {"shN": np.zeros((len(rows["means"]), 0), np.float32)}
+        for name, values in rows.items():
+            found[name] = np.ascontiguousarray(values, np.float32).reshape(len(values), math.prod(values.shape[1:]))
         return cls(
-            rows["means"],
-            rows["opacities"],
-            raw={name: rows[name].reshape(len(rows[name]), dims[name]) for name in splat.QUANTIZABLE},
-            sh_degree=shN_degree(rows["shN"].shape[1]),
+            found["means"],
+            found["opacities"][:, 0],
+            raw={name: found[name] for name in splat.QUANTIZABLE if name in found},
+            sh_degree=shN_degree(found["shN"].shape[1] // 3),
             **header,
+        )
+
+    @classmethod
+    def joined(cls, scenes: Sequence["CompressedScene"]) -> "CompressedScene":
+        """The splats of scenes, one after another, up to their highest degree; origin and settings are the first's.
+
+        Where all have a codebook, that is the rows of all, and the codes count on.
+
+        Raises:
+            ValueError: Only some are to be rendered with anti-aliasing.
+        """
+        first = scenes[0]
+        if len(scenes) == 1:
+            return first
+        if len({scene.antialiased for scene in scenes}) > 1:
+            raise ValueError(
+                "some of the scenes were trained with anti-aliasing and some were not; they cannot be joined"
+            )
+        degree = max(scene.sh_degree for scene in scenes)
+        scenes = [scene.with_degree(degree) for scene in scenes]
+        codes, codebooks, raw = {}, {}, {}
+        for name in splat.QUANTIZABLE:
+            if all(name in scene.codes for scene in scenes):
+                books = [scene.codebooks[name] for scene in scenes]
+                starts = np.cumsum([0, *map(len, books[:-1])])
+                codes[name] = np.concatenate([scene.codes[name] + i for scene, i in zip(scenes, starts, strict=True)])
+                codebooks[name] = np.concatenate(books)
+            else:
+                raw[name] = np.concatenate([scene.rows(name) for scene in scenes])
+        means = [scene.means + (np.array(scene.origin) - np.array(first.origin)) for scene in scenes]
+        return cls(
+            np.concatenate(means).astype(np.float32),
+            np.concatenate([scene.opacities for scene in scenes]),
+            codes,
+            codebooks,
+            raw,
+            sh_degree=degree,
+            config=first.config,
+            origin=first.origin,
         )
 
     def __len__(self) -> int:
@@ -113,21 +172,25 @@ class CompressedScene:
         """Whether it is to be rendered with anti-aliasing, as it was trained (``antialiased`` of :attr:`config`)."""
         return self.config.get("antialiased") is True
 
-    def values(self, name: str, rows: slice = slice(None)) -> Float32s:
-        """An attribute ``[N, ...]`` of all splats or some, bit for bit the rows of its codebook if it has one.
+    def rows(self, name: str, splats: slice = slice(None)) -> Float32s:
+        """An attribute ``[N, D]`` of all splats or some, bit for bit the rows of its codebook if it has one.
 
         Args:
             name: Attribute; positions are relative to ``origin``.
-            rows: Which splats.
+            splats: Which splats.
         """
-        values: Float32s
+        rows: Float32s
         if name in self.codes:
-            values = self.codebooks[name][self.codes[name][rows]]
+            rows = self.codebooks[name][self.codes[name][splats]]
         else:
-            values = (self.raw[name] if name in self.raw else getattr(self, name))[rows]
+            rows = (self.raw[name] if name in self.raw else getattr(self, name))[splats]
         if name in self.bases:  # exact in float64 for whole numbers, so rounded once
-            values = (values.astype(np.float64) @ self.bases[name].astype(np.float64)).astype(np.float32)
-        return values.reshape(len(values), *splat.attribute_shapes(self.sh_degree)[name])
+            rows = (rows.astype(np.float64) @ self.bases[name].astype(np.float64)).astype(np.float32)
+        return rows.reshape(len(rows), splat.attribute_dims(self.sh_degree)[name])
+
+    def values(self, name: str) -> Float32s:
+        """An attribute of all splats in the shape that :class:`nsvq_lightning.Splats` have it, see :meth:`rows`."""
+        return self.rows(name).reshape(len(self), *splat.attribute_shapes(self.sh_degree)[name])
 
     def decode(self) -> "Splats":
         """The decoded scene as :class:`nsvq_lightning.Splats`.
@@ -163,11 +226,29 @@ class CompressedScene:
             codebooks={name: self.codebooks[name][used if len(used) else [0]] for name, (used, _) in rows.items()},
         )
 
+    def in_morton_order(self) -> "CompressedScene":
+        """The splats in Morton order of their positions, in which many formats hold them: what is near follows."""
+        from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
+
+        return self.take(spatial_order(self.means))
+
+    def cropped(self, low: Float64s, high: Float64s) -> "CompressedScene":
+        """The splats whose centres are in a box, its sides included; codebooks stay as they are.
+
+        Args:
+            low: Smallest world coordinates ``[3]``.
+            high: Largest ``[3]``.
+        """
+        positions = self.means.astype(np.float64) + np.array(self.origin)
+        return self.take(((positions >= low) & (positions <= high)).all(1))
+
     def finite_rows(self) -> tuple[Bools, dict[str, int]]:
         """Which splats ``[N]`` have neither NaN nor infinite values, and how many do, by attribute."""
-        bad = {name: np.where(np.isfinite(rows).all(1), 0, np.nan) for name, rows in self.codebooks.items()}
-        flags = {name: flags.astype(np.float32)[self.codes[name]] for name, flags in bad.items()}
-        return splat.finite_rows({"means": self.means, "opacities": self.opacities, **self.raw, **flags})
+        found: dict[str, Any] = {"means": self.means, "opacities": self.opacities, **self.raw}
+        for name, codes in self.codes.items():
+            row_is_finite = np.isfinite(self.codebooks[name]).all(1)
+            found[name] = np.where(row_is_finite, np.float32(0), np.float32(np.nan))[codes]
+        return splat.finite_rows(found)
 
     def relative_to(self, origin: tuple[float, float, float]) -> "CompressedScene":
         """The same scene with another origin of its positions."""
@@ -190,6 +271,47 @@ class CompressedScene:
             return self
         log.warning(splat.dropped(keep, culprits))
         return self.take(keep)
+
+    def changed(self, changes: Mapping[str, Callable[[Float32s], NDArray[Any]]], **fields: Any) -> "CompressedScene":
+        """The scene with other values of attributes, by the rows of their codebooks or bases where they have those.
+
+        Args:
+            changes: By attribute, what makes rows ``[.., D]`` others; they are rounded to float32.
+            fields: Fields of the scene that change, too.
+        """
+
+        def rows(tables: Mapping[str, Float32s]) -> dict[str, Float32s]:
+            found = dict(tables)
+            for name in changes.keys() & tables.keys():
+                found[name] = changes[name](tables[name]).astype(np.float32)
+            return found
+
+        raw = rows({name: values for name, values in self.raw.items() if name not in self.bases})
+        return replace(
+            self,
+            codebooks=rows(self.codebooks),
+            raw={**self.raw, **raw},
+            bases=rows(self.bases),
+            stored_bytes=None,
+            **fields,
+        )
+
+    def with_degree(self, degree: int) -> "CompressedScene":
+        """The scene with spherical harmonics up to a degree, 0 to 3: higher ones are left out, missing ones are 0."""
+        if degree == self.sh_degree:
+            return self
+        width = splat.attribute_dims(degree)["shN"]
+
+        def fitted(rows: Float32s) -> Float32s:
+            return np.pad(rows[:, :width], ((0, 0), (0, max(0, width - rows.shape[1]))))
+
+        scene = self
+        if degree == 0 or "shN" in self.bases:  # no codebook at degree 0, nor a basis of another width
+            codes = {name: codes for name, codes in self.codes.items() if name != "shN"}
+            codebooks = {name: self.codebooks[name] for name in codes}
+            raw = {**self.raw, "shN": self.rows("shN")}
+            scene = replace(self, codes=codes, codebooks=codebooks, raw=raw, bases={})
+        return scene.changed({"shN": fitted}, sh_degree=degree)
 
 
 def _check_floats(name: str, array: Float32s, shape: tuple[int, ...]) -> None:
@@ -214,186 +336,3 @@ def _check_codes(name: str, codes: NDArray[np.integer], codebook: Float32s, n: i
         raise ValueError(f"codebooks[{name!r}] is empty; a codebook needs at least one row")
     if n and not (int(codes.min()) >= 0 and int(codes.max()) < rows):
         raise ValueError(f"codes[{name!r}] must be in 0..{rows - 1}, got {codes.min()}..{codes.max()}")
-
-
-def in_morton_order(scene: CompressedScene) -> CompressedScene:
-    """The splats in Morton order of their positions, in which many formats hold them: what is near follows."""
-    from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
-
-    return scene.take(spatial_order(scene.means))
-
-
-# Rotations that turn COLMAP's up, -y, to an axis; x stays.
-UP_AXES = {
-    "y": np.diag([1.0, -1.0, -1.0]),
-    "minus-y": np.eye(3),
-    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
-    "minus-z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-}
-
-
-def turn_up(up: Float64s, axis: str) -> Float64s:
-    """The rotation ``[3, 3]`` that turns a direction to an axis: the shortest way to -y, then around x.
-
-    Args:
-        up: Direction ``[3]`` of length 1.
-        axis: One of :data:`UP_AXES`.
-    """
-    goal = np.array([0.0, -1.0, 0.0])
-    # Two reflections: one that swaps opposite directions needs another mirror than the one between them.
-    between = up + goal
-    if between @ between < 1e-12:
-        return np.asarray(UP_AXES[axis] @ UP_AXES["y"])
-    first, second = (np.eye(3) - 2 * np.outer(v, v) / (v @ v) for v in (goal, between))
-    return np.asarray(UP_AXES[axis] @ first @ second)
-
-
-# Half around z: right, down, front becomes left, up, front, the axes of glTF and USD.
-HALF_TURN = np.diag([-1.0, -1.0, 1.0])
-
-
-def rotated(scene: CompressedScene, rotation: Float64s) -> CompressedScene:
-    """The scene turned about the world's origin by a rotation ``[3, 3]``, see :func:`moved`."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    return moved(scene, matrix)
-
-
-def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
-    """The scene turned, scaled and moved.
-
-    Positions, scales, rotations and spherical harmonics change, the last three by the rows of their codebooks; numbers
-    are rounded once, to float32.
-
-    Args:
-        scene: The scene.
-        matrix: From old to new world coordinates ``[4, 4]``: a rotation times a positive number, and a translation.
-
-    Raises:
-        ValueError: It stretches, mirrors or is not finite.
-    """
-    import torch
-
-    from nsvq_lightning.rendering.sh import sh_rotation
-
-    linear, shift = matrix[:3, :3], matrix[:3, 3]
-    size = float(np.cbrt(np.linalg.det(linear)))
-    if not (
-        np.isfinite(matrix).all()
-        and size > 0
-        and np.allclose(linear @ linear.T, size**2 * np.eye(3), 0, 1e-5 * size**2)
-    ):
-        raise ValueError(
-            f"{linear.tolist()} is no rotation times a number: splats can be turned and scaled evenly only"
-        )
-    rotation = linear / size
-    harmonics = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
-
-    def rows(tables: Mapping[str, Float32s]) -> dict[str, Float32s]:
-        found = dict(tables)
-        if "scales" in found and size != 1:
-            found["scales"] = (found["scales"] + np.log(size)).astype(np.float32)
-        if "quats" in found:
-            found["quats"] = turned(found["quats"], rotation)
-        if "shN" in found:
-            wide = found["shN"].reshape(len(found["shN"]), len(harmonics), 3).astype(np.float64)
-            found["shN"] = (harmonics @ wide).reshape(found["shN"].shape).astype(np.float32)
-        return found
-
-    has_origin = any(scene.origin)
-    means = scene.means.astype(np.float64) @ linear.T + (0 if has_origin else shift)
-    x, y, z = (linear @ np.array(scene.origin) + (shift if has_origin else 0)).tolist()
-    return replace(
-        scene,
-        means=means.astype(np.float32),
-        codebooks=rows(scene.codebooks),
-        raw={**scene.raw, **rows({name: values for name, values in scene.raw.items() if name not in scene.bases})},
-        bases=rows(scene.bases),
-        origin=(x, y, z),
-        stored_bytes=None,
-    )
-
-
-def placed(scene: CompressedScene, frame: "Frame") -> CompressedScene:
-    """The scene in the coordinates of its files, from those of the frame that it was trained in."""
-
-    def rows(tables: Mapping[str, Float32s]) -> dict[str, Float32s]:
-        longer = np.log(frame.unit)
-        return {name: (rows + longer).astype(np.float32) if name == "scales" else rows for name, rows in tables.items()}
-
-    means = (frame.unit * scene.means.astype(np.float64) + frame.middle).astype(np.float32)
-    raw, codebooks = rows(scene.raw), rows(scene.codebooks)
-    return replace(scene, means=means, raw=raw, codebooks=codebooks, origin=frame.origin, stored_bytes=None)
-
-
-def with_degree(scene: CompressedScene, degree: int) -> CompressedScene:
-    """The scene with spherical harmonics up to a degree, 0 to 3: higher ones are left out, missing ones are 0."""
-    if degree == scene.sh_degree:
-        return scene
-    dims = splat.attribute_dims(scene.sh_degree)["shN"], splat.attribute_dims(degree)["shN"]
-
-    def rows(tables: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        found = dict(tables)
-        if "shN" in found:
-            found["shN"] = np.pad(found["shN"][:, : dims[1]], ((0, 0), (0, max(0, dims[1] - dims[0]))))
-        return found
-
-    if degree == 0 or "shN" in scene.bases:  # no codebook at degree 0, nor a basis of another width
-        values = scene.values("shN").reshape(len(scene), dims[0])
-        codes = {name: codes for name, codes in scene.codes.items() if name != "shN"}
-        codebooks = {name: scene.codebooks[name] for name in codes}
-        raw = rows({**scene.raw, "shN": values})
-        return replace(scene, codes=codes, codebooks=codebooks, raw=raw, bases={}, sh_degree=degree)
-    return replace(scene, codebooks=rows(scene.codebooks), raw=rows(scene.raw), sh_degree=degree)
-
-
-def joined(scenes: Sequence[CompressedScene]) -> CompressedScene:
-    """The splats of scenes, one after another, up to their highest degree; origin and settings are those of the first.
-
-    Where all have a codebook, that is the rows of all, and the codes count on.
-
-    Raises:
-        ValueError: Only some are to be rendered with anti-aliasing.
-    """
-    first = scenes[0]
-    if len(scenes) == 1:
-        return first
-    if len({scene.antialiased for scene in scenes}) > 1:
-        raise ValueError("some of the scenes were trained with anti-aliasing and some were not; they cannot be joined")
-    degree = max(scene.sh_degree for scene in scenes)
-    scenes = [with_degree(scene, degree) for scene in scenes]
-    shared = [name for name in splat.QUANTIZABLE if all(name in scene.codes for scene in scenes)]
-    starts = {name: np.cumsum([0, *(len(scene.codebooks[name]) for scene in scenes)]) for name in shared}
-    means = [scene.means + (np.array(scene.origin) - np.array(first.origin)) for scene in scenes]
-    dims = splat.attribute_dims(degree)
-    return CompressedScene(
-        np.concatenate(means).astype(np.float32),
-        np.concatenate([scene.opacities for scene in scenes]),
-        codes={
-            name: np.concatenate(
-                [scene.codes[name] + start for scene, start in zip(scenes, starts[name], strict=False)]
-            )
-            for name in shared
-        },
-        codebooks={name: np.concatenate([scene.codebooks[name] for scene in scenes]) for name in shared},
-        raw={
-            name: np.concatenate([scene.values(name).reshape(len(scene), dims[name]) for scene in scenes])
-            for name in splat.QUANTIZABLE
-            if name not in shared
-        },
-        sh_degree=degree,
-        config=first.config,
-        origin=first.origin,
-    )
-
-
-def cropped(scene: CompressedScene, low: Float64s, high: Float64s) -> CompressedScene:
-    """The splats whose centres are in a box, its sides included; codebooks stay as they are.
-
-    Args:
-        scene: The scene.
-        low: Smallest world coordinates ``[3]``.
-        high: Largest ``[3]``.
-    """
-    positions = scene.means.astype(np.float64) + np.array(scene.origin)
-    return scene.take(((positions >= low) & (positions <= high)).all(1))

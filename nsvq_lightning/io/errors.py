@@ -5,9 +5,11 @@ numbers shrink to nothing: a few kilobytes would otherwise ask for all memory th
 takes 16 bits or more of a splat, and a whole splat 5 bytes or more in every format.
 """
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import fspath
+from typing import Any
 
 from nsvq_lightning.io.atomic import StrPath
 
@@ -46,6 +48,21 @@ def wrong_start(suffix: str, data: bytes, magic: bytes) -> FormatError:
         return FormatError(f"a pointer of Git LFS, not the {suffix} file itself", "get it by 'git lfs pull'")
     cut = "truncated, or " if magic.startswith(data[: len(magic)]) else ""
     return FormatError(f"{cut}not a {suffix} file: it does not start with {magic.decode('latin-1')!r}")
+
+
+def json_object(text: bytes, name: str) -> dict[str, Any]:
+    """The object that a file, or a part of one of this name, holds as JSON.
+
+    Raises:
+        FormatError: It holds something else.
+    """
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"damaged: {name} is not JSON ({error})") from None
+    if not isinstance(found, dict):
+        raise FormatError(f"damaged: {name} is not a JSON object")
+    return found
 
 
 # Splats that any file may hold, however short, such as one of equal splats; beyond, each takes two bytes or more. A

@@ -10,7 +10,7 @@ import numpy as np
 
 from nsvq_lightning.io import glb, lod, ply, sog, splat, spz, usda
 from nsvq_lightning.io.atomic import StrPath
-from nsvq_lightning.io.compressed import CompressedScene, in_morton_order
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import naming_file
 from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.precision import Storage
@@ -67,7 +67,7 @@ def read_scene(path: StrPath) -> CompressedScene:
     scene = format_of(path).read(path)
     with naming_file(path):
         kept = scene.finite()
-    if unturned := len(kept) - np.count_nonzero(kept.values("quats").any(axis=1)):
+    if unturned := len(kept) - np.count_nonzero(kept.rows("quats").any(axis=1)):
         logger.warning("%s: %d of %d splats have the rotation 0 0 0 0: not turned", path, unturned, len(kept))
     return replace(kept, stored_bytes=scene.stored_bytes or path.stat().st_size)
 
@@ -147,7 +147,7 @@ _WAYS = {
 FORMATS: dict[str, Format] = {
     ".ply": Format("3D Gaussian Splatting", ply.read_ply, ply.write_ply),
     ".nsvq": Format("compressed scene of this package", read_nsvq, write_nsvq, native=True),
-    ".sog": Format("PlayCanvas, SuperSplat", sog.read_sog, sog.write_sog, in_order=in_morton_order),
+    ".sog": Format("PlayCanvas, SuperSplat", sog.read_sog, sog.write_sog, in_order=CompressedScene.in_morton_order),
     ".spz": Format("Niantic", spz.read_spz, spz.write_spz, in_order=spz.in_spz_order),
     ".glb": Format("glTF, KHR_gaussian_splatting", glb.read_glb, glb.write_glb),
     ".usda": Format("OpenUSD, for scenes of moderate size", usda.read_usda, usda.write_usda),
@@ -155,7 +155,7 @@ FORMATS: dict[str, Format] = {
         "PlayCanvas, SuperSplat",
         ply.read_ply,
         ply.write_compressed_ply,
-        in_order=in_morton_order,
+        in_order=CompressedScene.in_morton_order,
     ),
     lod.NAME: Format(
         "streamed SOG, a folder with levels of detail",

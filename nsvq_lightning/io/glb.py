@@ -9,7 +9,6 @@ import json
 import logging
 import struct
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
-from nsvq_lightning.io.compressed import HALF_TURN, CompressedScene, joined, moved, rotated
-from nsvq_lightning.io.errors import FormatError, check_room, naming_file, wrong_start
-from nsvq_lightning.io.numbers import FLAT, logits_of, logs_of_lengths, opacity_of
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.errors import FormatError, check_room, json_object, naming_file, wrong_start
+from nsvq_lightning.io.numbers import finite_logs, logits_of, logs_of_lengths, opacity_of
+from nsvq_lightning.io.placing import HALF_TURN, moved, rotated
 from nsvq_lightning.splats.conventions import SH_C0, Float32s, Float64s, sh_coefficients, unit
 
 log = logging.getLogger(__name__)
@@ -51,29 +51,37 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
         Bytes of the file.
     """
     scene = rotated(scene, HALF_TURN)
-    opacities, sh0 = opacity_of(scene.opacities), scene.values("sh0")[:, 0]
+    opacities = opacity_of(scene.opacities)
+    sh0 = scene.rows("sh0")
     # The fallback is linear light; what the splats have is meant for display.
     shown = np.clip(0.5 + SH_C0 * sh0.astype(np.float64), 0, 1)
     linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     arrays: dict[str, NDArray[Any]] = {
         "POSITION": scene.means,
         "COLOR_0": np.rint(255 * np.c_[linear, opacities]).astype(np.uint8),
-        f"{EXTENSION}:ROTATION": unit(scene.values("quats"))[:, [1, 2, 3, 0]].astype(np.float32),
-        f"{EXTENSION}:SCALE": np.exp(scene.values("scales")),
+        f"{EXTENSION}:ROTATION": unit(scene.rows("quats"))[:, [1, 2, 3, 0]].astype(np.float32),
+        f"{EXTENSION}:SCALE": np.exp(scene.rows("scales")),
         OPACITY: opacities.astype(np.float32)[:, None],
         _harmonic(0): sh0,
     }
-    shN = scene.values("shN")
-    arrays |= {_harmonic(number + 1): shN[:, number] for number in range(sh_coefficients(scene.sh_degree))}
+    for number, coefficients in enumerate(scene.values("shN").swapaxes(0, 1), 1):
+        arrays[_harmonic(number)] = coefficients
     kinds = {width: name for name, width in _WIDTHS.items()}
     views: list[_Json] = []
     accessors: list[_Json] = []
     end = 0
-    for values in arrays.values():
-        views.append({"buffer": 0, "byteOffset": end, "byteLength": values.nbytes, "target": _ARRAY_BUFFER})
-        accessor = {"bufferView": len(accessors), "count": len(scene), "type": kinds[values.shape[1]]}
+    for number, values in enumerate(arrays.values()):
         is_byte = values.dtype == np.uint8
-        accessors.append(accessor | {"componentType": _BYTE if is_byte else _FLOAT, "normalized": is_byte})
+        views.append({"buffer": 0, "byteOffset": end, "byteLength": values.nbytes, "target": _ARRAY_BUFFER})
+        accessors.append(
+            {
+                "bufferView": number,
+                "count": len(scene),
+                "type": kinds[values.shape[1]],
+                "componentType": _BYTE if is_byte else _FLOAT,
+                "normalized": is_byte,
+            }
+        )
         end += values.nbytes
     accessors[0] |= {"min": scene.means.min(0).tolist(), "max": scene.means.max(0).tolist()}
     about = {
@@ -127,17 +135,14 @@ def read_glb(path: StrPath) -> CompressedScene:
             if not parts:
                 used = ", ".join(map(str, document.get("extensionsUsed", ()))) or "none"
                 raise FormatError(f"no primitive has the extension {EXTENSION}; used are: {used}", "export splats so")
-            scene = rotated(joined(parts), HALF_TURN)
-            extras = document["asset"].get("extras")
+            return rotated(CompressedScene.joined(parts), HALF_TURN)
         except (KeyError, TypeError, IndexError, AttributeError, ValueError, RecursionError) as error:
             if isinstance(error, FormatError):
                 raise
             raise FormatError(f"of a kind that is not read, or altered: {error!r}", "save it as a plain .glb") from None
-    antialiased = isinstance(extras, dict) and extras.get("antialiased") is True
-    return replace(scene, config={"antialiased": True}) if antialiased else scene
 
 
-_MOST_JSON = 1 << 26
+_MAX_JSON = 1 << 26
 
 
 def _parsed(data: bytes) -> tuple[_Json, memoryview]:
@@ -147,30 +152,29 @@ def _parsed(data: bytes) -> tuple[_Json, memoryview]:
     _, version, total = _HEAD.unpack_from(data)
     length, kind = _CHUNK.unpack_from(data, _HEAD.size)
     start = _HEAD.size + _CHUNK.size
-    if version != 2 or total > len(data) or kind != b"JSON" or start + length > len(data) or length > _MOST_JSON:
+    end = start + length
+    if version != 2 or max(total, end) > len(data) or kind != b"JSON" or length > _MAX_JSON:
         raise FormatError(f"truncated or damaged: version {version}, {total} of {len(data)} bytes, a chunk of {length}")
-    try:
-        document = json.loads(data[start : start + length])
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"damaged: the first chunk is not JSON ({error})") from None
-    if not isinstance(document, dict):
-        raise FormatError("damaged: the first chunk is not a JSON object")
-    return document, memoryview(data)[start + length + _CHUNK.size :]
+    return json_object(data[start:end], "the first chunk"), memoryview(data)[end + _CHUNK.size :]
 
 
 def _primitives(document: _Json) -> Iterator[tuple[_Json, Float64s]]:
     """Those with splats, and the matrix ``[4, 4]`` of the node that each is in."""
     nodes = document["nodes"]
-    stack = [(number, np.eye(4)) for number in reversed(document["scenes"][document.get("scene", 0)]["nodes"])]
+    roots = document["scenes"][document.get("scene", 0)]["nodes"]
+    stack = [(number, np.eye(4)) for number in reversed(roots)]
     steps = 0
     while stack:
         number, outer = stack.pop()
-        node, steps = nodes[number], steps + 1
+        node = nodes[number]
+        steps += 1
         if steps > len(nodes):
             raise ValueError("a node is in two others")
         matrix = outer @ _matrix(node)
         stack += [(child, matrix) for child in reversed(node.get("children", ()))]
-        for primitive in document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
+        if "mesh" not in node:
+            continue
+        for primitive in document["meshes"][node["mesh"]]["primitives"]:
             if EXTENSION in primitive.get("extensions", {}):
                 yield primitive, matrix
 
@@ -206,17 +210,23 @@ def _splats(document: _Json, data: memoryview, primitive: _Json) -> CompressedSc
         return _accessor(document, data, names[name])
 
     degree = max((degree for degree in range(4) if _harmonic((degree + 1) ** 2 - 1) in names), default=0)
-    higher = [values(_harmonic(number + 1)) for number in range(sh_coefficients(degree))]
-    means = values("POSITION")
-    raw = {
+    rows = {
+        "means": values("POSITION"),
         "quats": values(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
         "scales": _logs_of_scale(values(f"{EXTENSION}:SCALE")),
-        # In drafts, colours and opacities were those of the points.
-        "sh0": values(_harmonic(0)) if _harmonic(0) in names else (values("COLOR_0")[:, :3] - 0.5) / np.float32(SH_C0),
-        "shN": np.concatenate([np.zeros((len(means), 0), np.float32), *higher], axis=1),
     }
-    opacities = values(OPACITY if OPACITY in names else "COLOR_0")[:, -1]
-    return CompressedScene(means, logits_of(opacities), raw=raw, sh_degree=degree)
+    # In drafts, colours and opacities were those of the points.
+    rows["opacities"] = logits_of(values(OPACITY if OPACITY in names else "COLOR_0")[:, -1])
+    if _harmonic(0) in names:
+        rows["sh0"] = values(_harmonic(0))
+    else:
+        rows["sh0"] = (values("COLOR_0")[:, :3] - 0.5) / np.float32(SH_C0)
+    if degree:
+        higher = [values(_harmonic(number + 1)) for number in range(sh_coefficients(degree))]
+        rows["shN"] = np.concatenate(higher, axis=1)
+    extras = document["asset"].get("extras")
+    antialiased = isinstance(extras, dict) and extras.get("antialiased") is True
+    return CompressedScene.from_rows(rows, antialiased=antialiased)
 
 
 def _logs_of_scale(scale: Float32s) -> Float32s:
@@ -224,8 +234,7 @@ def _logs_of_scale(scale: Float32s) -> Float32s:
     if not (scale < 0).any():
         return logs_of_lengths(scale)
     log.warning("SCALE has negative numbers: taken as logarithms of lengths, which it was in drafts")
-    scale[np.isneginf(scale)] = FLAT
-    return scale
+    return finite_logs(scale)
 
 
 def _accessor(document: _Json, data: memoryview, number: int) -> Float32s:
@@ -236,10 +245,12 @@ def _accessor(document: _Json, data: memoryview, number: int) -> Float32s:
         raise FormatError(f"numbers are compressed by {', '.join(packed)}, which is not read", "save them without it")
     if "sparse" in accessor or view.get("buffer", 0) or "uri" in document["buffers"][0]:
         raise FormatError("numbers in sparse accessors or in other files are not read", "save it as a plain .glb")
-    dtype, width, count = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[accessor["type"]], accessor["count"]
-    start, stride = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), view.get("byteStride")
+    dtype = np.dtype(_COMPONENTS[accessor["componentType"]])
+    width = _WIDTHS[accessor["type"]]
+    count = accessor["count"]
+    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
     row = width * dtype.itemsize
-    stride = row if stride is None else stride
+    stride = view.get("byteStride", row)
     if type(count) is not int or count < 0 or start < 0 or stride < row:
         raise ValueError(f"accessor {number} is out of range")
     if count and start + (count - 1) * stride + row > len(data):

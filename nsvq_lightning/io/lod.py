@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write, write_text
-from nsvq_lightning.io.compressed import CompressedScene, joined
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.sog import META, PALETTE_LIMIT, read_sog, sog_contents
 from nsvq_lightning.splats.conventions import Float64s, unit
@@ -134,8 +134,8 @@ def _boxes(scene: CompressedScene) -> Float64s:
     """Smallest and largest coordinates ``[N, 2, 3]`` of the ellipsoid of each splat."""
     from scipy.spatial.transform import Rotation
 
-    axes = Rotation.from_quat(unit(scene.values("quats"))[:, [1, 2, 3, 0]]).as_matrix()
-    lengths = np.exp(scene.values("scales").astype(np.float64))
+    axes = Rotation.from_quat(unit(scene.rows("quats"))[:, [1, 2, 3, 0]]).as_matrix()
+    lengths = np.exp(scene.rows("scales").astype(np.float64))
     reach = _REACH * np.sqrt(np.square(axes * lengths[:, None, :]).sum(2))
     return np.stack([scene.means - reach, scene.means + reach], axis=1)
 
@@ -202,4 +202,5 @@ def read_lod(path: StrPath) -> CompressedScene:
     """
     path = Path(path)
     parts = [read_sog(path.parent / name) for name in _index(path)["shown"]]
-    return replace(joined(parts), stored_bytes=path.stat().st_size + sum(part.stored_bytes or 0 for part in parts))
+    size = path.stat().st_size + sum(part.stored_bytes or 0 for part in parts)
+    return replace(CompressedScene.joined(parts), stored_bytes=size)

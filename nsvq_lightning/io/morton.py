@@ -62,8 +62,7 @@ class Grid:
         """Centre of the cell of ``depths [N]`` bits that holds each cell ``[N, 3]``, scene units."""
         shift = (AXIS_BITS - depths)[:, None]
         middle = (cells >> shift << shift) + 0.5 * (np.int64(1) << shift) + np.array(self.base, np.float64)
-        centers: Float32s = (middle * self.step).astype(np.float32)
-        return centers
+        return (middle * self.step).astype(np.float32)
 
 
 def morton_keys(cells: Int64s, depths: Int64s) -> Uint64s:

@@ -14,8 +14,7 @@ from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int32s,
 
 def opacity_of(logits: Float32s) -> Float64s:
     """Opacities in [0, 1] of logits of any shape."""
-    opacities: Float64s = 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
-    return opacities
+    return 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -80, 80)))
 
 
 # Magnitude of the logit that replaces ±inf: its sigmoid is 1 in float32, and training can still move it.
@@ -34,6 +33,11 @@ def logits_of(opacities: NDArray[np.floating[Any]]) -> Float32s:
         return finite_logits((np.log(wide) - np.log1p(-wide)).astype(np.float32))
 
 
+def bytes_of(logits: Float32s) -> Uint8s:
+    """The opacities of logits of any shape in 255ths."""
+    return np.rint(255 * opacity_of(logits)).astype(np.uint8)
+
+
 def logits_of_bytes(levels: Uint8s) -> Float32s:
     """Finite logits of opacities given in 255ths."""
     return logits_of(np.arange(256) / 255)[levels]
@@ -42,6 +46,11 @@ def logits_of_bytes(levels: Uint8s) -> Float32s:
 # Logarithm that stands for that of an axis length of 0, which discs have: too thin to show, and not beyond any format's
 # range by more than it must be.
 FLAT = -20.0
+
+
+def finite_logs(logs: Float32s) -> Float32s:
+    """The logarithms with :data:`FLAT` in place of -inf."""
+    return np.where(np.isneginf(logs), np.float32(FLAT), logs)
 
 
 def logs_of_lengths(lengths: Float32s) -> Float32s:
@@ -76,8 +85,7 @@ class Clamped:
         """
         rounded = np.clip(np.rint(values), *ends)
         self._count(name, np.abs(rounded - values) > 0.5 + _ROUNDING)
-        integers: Int32s = np.nan_to_num(rounded).astype(np.int32)
-        return integers
+        return np.asarray(np.nan_to_num(rounded), np.int32)
 
     def within(self, name: str, values: Float32s, low: float, high: float) -> Float32s:
         """Values ``[N, ...]`` clamped to [``low``, ``high``]; ``name`` is that of :meth:`nearest`."""

@@ -5,16 +5,16 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
-from nsvq_lightning.io.compressed import CompressedScene, in_morton_order
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
-from nsvq_lightning.io.numbers import FLAT, finite_logits, logits_of_bytes, opacity_of
+from nsvq_lightning.io.numbers import FLAT, finite_logits, finite_logs, logits_of, opacity_of
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
 from nsvq_lightning.splats.conventions import (
     SH_C0,
@@ -73,7 +73,8 @@ def read_ply_header(path: StrPath) -> PlyHeader:
         FormatError: The header is truncated or malformed, or has no vertices; or the rest is truncated.
     """
     with naming_file(path), open(path, "rb") as file:
-        header, file_bytes = _parsed(file), os.fstat(file.fileno()).st_size
+        header = _parsed(file)
+        file_bytes = os.fstat(file.fileno()).st_size
         # An ascii value takes at least one digit and one separator; the last separator may be missing.
         row_bytes = 2 * len(header.properties) if header.encoding == "ascii" else header.dtype.itemsize
         needed = header.offset + header.count * row_bytes - (header.encoding == "ascii" and header.count > 0)
@@ -92,12 +93,20 @@ _TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8", "half": "f2", "float16": "f2"},
 }
-# Properties of a compressed ``.ply``; the opacity is in the colour.
-_PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
+# Bits of the numbers in each property of a compressed ``.ply``, the last one in the lowest; opacities are in the colour.
+_PACKED = {
+    "packed_position": (11, 10, 11),
+    "packed_rotation": (10, 10, 10),
+    "packed_scale": (11, 10, 11),
+    "packed_color": (8, 8, 8, 8),
+}
+_LENGTHS = ["scale_x", "scale_y", "scale_z"]
+# Splats of a compressed ``.ply`` that follow each other and share a row of bounds.
+_CHUNK = 256
 # Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene.
 _ROWS = 1 << 12
 # Of a header; some programs write their cameras into its comments.
-_MOST_HEADER = 1 << 26
+_MAX_HEADER = 1 << 26
 
 
 def _parsed(file: BinaryIO) -> PlyHeader:
@@ -105,7 +114,7 @@ def _parsed(file: BinaryIO) -> PlyHeader:
     start = file.read(1 << 16)
     if not re.match(rb"ply[ \t]*\r?\n", start):
         raise wrong_start(".ply", start, b"ply")
-    while (end := re.search(rb"\nend_header[ \t]*\r?\n", start)) is None and len(start) < _MOST_HEADER:
+    while (end := re.search(rb"\nend_header[ \t]*\r?\n", start)) is None and len(start) < _MAX_HEADER:
         if not (more := file.read(len(start))):
             break
         start += more
@@ -232,17 +241,18 @@ def _coefficients(colors: Float32s, is_float: bool) -> Float32s:
 
 
 def _check_packed(header: PlyHeader) -> None:
-    chunk, sh = header.others["chunk"], header.others.get("sh")
-    names = ["x", "y", "z", "scale_x", "scale_y", "scale_z", *("rgb" if "min_r" in chunk.properties else "")]
+    chunk = header.others["chunk"]
+    sh = header.others.get("sh")
+    names = [*"xyz", *_LENGTHS, *("rgb" if "min_r" in chunk.properties else "")]
     bounds = [f"{end}_{name}" for end in ("min", "max") for name in names]
-    expected = [(header, _PACKED, "u4"), (chunk, bounds, "f4")]
+    expected = [(header, list(_PACKED), "u4"), (chunk, bounds, "f4")]
     if sh:
-        expected.append((sh, [*sh.properties], "u1"))
+        expected.append((sh, list(sh.properties), "u1"))
     for table, columns, kind in expected:
         for name in columns:
             if name not in table.properties or table.dtype[name].str[1:] != kind:
                 raise FormatError(f"not a compressed .ply of Gaussian splats: no property {name} of type {kind}")
-    if header.encoding == "ascii" or chunk.count < -(-header.count // 256) or (sh and sh.count != header.count):
+    if header.encoding == "ascii" or chunk.count < -(-header.count // _CHUNK) or (sh and sh.count != header.count):
         raise FormatError(
             f"damaged: {header.count} compressed splats, {chunk.count} chunks of 256"
             f"{f', harmonics of {sh.count}' if sh else ''}, {header.encoding}"
@@ -264,34 +274,38 @@ def read_ply(path: StrPath) -> CompressedScene:
     with naming_file(path):
         sh_degree = splat_degree(header)
     read = _read_packed if header.packed else _read_plain
-    raw = read(path, header, sh_degree)
-    means, opacities = raw.pop("means"), raw.pop("opacities")[:, 0]
-    config = {"antialiased": True} if header.antialiased else {}
-    return CompressedScene(means, opacities, raw=raw, sh_degree=sh_degree, config=config)
+    return CompressedScene.from_rows(read(path, header, sh_degree), antialiased=header.antialiased)
 
 
-def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, Float32s]:
+def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, NDArray[Any]]:
     """Rows ``[N, D]`` of each attribute."""
     columns = _needed(header, sh_degree)
     # A third scale that is not there stays flat.
-    raw = {name: np.full((header.count, dim), FLAT, np.float32) for name, dim in attribute_dims(sh_degree).items()}
+    rows = {name: np.full((header.count, dim), FLAT, np.float32) for name, dim in attribute_dims(sh_degree).items()}
     ends = np.cumsum([len(names) for names in columns.values()])
     start = 0
-    for table in read_ply_columns(path, header, [name for names in columns.values() for name in names]):
-        for name, part in zip(raw, np.split(table, ends[:-1], axis=1), strict=True):
-            rows = _by_coefficient(part) if name == "shN" else part
-            raw[name][start : start + len(table), : rows.shape[1]] = rows
+    for table in read_ply_columns(path, header, [*chain(*columns.values())]):
+        parts = dict(zip(columns, np.split(table, ends[:-1], axis=1), strict=True))
+        parts["shN"] = _by_coefficient(parts["shN"])
+        for name, part in parts.items():
+            rows[name][start : start + len(table), : part.shape[1]] = part
         start += len(table)
     if columns["sh0"] == _RGB:
-        raw["sh0"] = _coefficients(raw["sh0"], header.dtype["red"].kind == "f")
-    raw["scales"][np.isneginf(raw["scales"])] = FLAT
+        rows["sh0"] = _coefficients(rows["sh0"], header.dtype["red"].kind == "f")
+    rows["scales"] = finite_logs(rows["scales"])
     # Writers that store opacity as a byte make 0 and 255 infinite logits.
-    return raw | {"opacities": finite_logits(raw["opacities"])}
+    rows["opacities"] = finite_logits(rows["opacities"])
+    return rows
 
 
-def _by_coefficient(rows: Float32s) -> Float32s:
+def _by_coefficient(rows: NDArray[Any]) -> NDArray[Any]:
     """Higher coefficients ``[N, D]``, all of red first, in our order: the three colours of each coefficient."""
     return rows.reshape(len(rows), 3, rows.shape[1] // 3).swapaxes(1, 2).reshape(rows.shape)
+
+
+def _by_color(rows: NDArray[Any]) -> NDArray[Any]:
+    """Invert :func:`_by_coefficient`."""
+    return rows.reshape(len(rows), rows.shape[1] // 3, 3).swapaxes(1, 2).reshape(rows.shape)
 
 
 def read_ply_columns(
@@ -332,44 +346,55 @@ def _read_ascii(file: BinaryIO, header: PlyHeader) -> Float64s:
     return table
 
 
-def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, Float32s]:
-    """Rows ``[N, D]`` of each attribute of a compressed ``.ply``; 256 that follow each other share a row of bounds."""
-    chunks, vertices = (
-        np.fromfile(path, table.dtype, table.count, offset=table.offset) for table in (header.others["chunk"], header)
-    )
+def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, NDArray[Any]]:
+    """Rows ``[N, D]`` of each attribute of a compressed ``.ply``."""
+    chunks = _table(path, header.others["chunk"])
+    vertices = _table(path, header)
+    shares = {name: _unpacked(vertices[name], bits) for name, bits in _PACKED.items()}
 
     def within(parts: Float64s, names: Sequence[str]) -> Float64s:
         """Shares of the ways from the smallest to the largest values of the chunk, ``[N, 3]``."""
-        ends = (np.stack([chunks[f"{end}_{name}"] for name in names], 1, dtype=np.float64) for end in ("min", "max"))
-        low, high = (np.repeat(end, 256, axis=0)[: header.count] for end in ends)
+        bounds = [np.stack([chunks[f"{end}_{name}"] for name in names], axis=1) for end in ("min", "max")]
+        low, high = (_for_each(bound, header.count) for bound in bounds)
         return low * (1 - parts) + high * parts
 
-    rotations, colors = vertices["packed_rotation"], _parts(vertices["packed_color"], 8, 8, 8, 8)
-    rgb = within(colors[:, :3], "rgb") if "min_r" in header.others["chunk"].properties else colors[:, :3]
-    others = (_parts(rotations, 10, 10, 10) - 0.5) * math.sqrt(2)
-    shN = np.zeros((header.count, 0), np.float32)
+    colors = shares["packed_color"][:, :3]
+    if "min_r" in header.others["chunk"].properties:
+        colors = within(colors, "rgb")
+    largest = (vertices["packed_rotation"] >> 30).astype(np.intp)
+    rows: dict[str, NDArray[Any]] = {
+        "means": within(shares["packed_position"], "xyz"),
+        "quats": from_smallest_three(largest, (shares["packed_rotation"] - 0.5) * math.sqrt(2)),
+        "scales": within(shares["packed_scale"], _LENGTHS),
+        "opacities": logits_of(shares["packed_color"][:, 3]),
+        "sh0": (colors - 0.5) / SH_C0,
+    }
     if sh_degree:
-        sh = header.others["sh"]
-        rows = np.fromfile(path, sh.dtype, sh.count, offset=sh.offset)
+        levels = _table(path, header.others["sh"])
         # Bytes stand for the middles of 256ths, the first and the last for the ends.
         values = (8 * (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1] - 0.5)).astype(np.float32)
-        shN = _by_coefficient(np.stack([values[rows[name]] for name in splat_columns(sh_degree)["shN"]], axis=1))
-    positions, sizes = _parts(vertices["packed_position"], 11, 10, 11), _parts(vertices["packed_scale"], 11, 10, 11)
-    return {
-        "means": within(positions, "xyz").astype(np.float32),
-        "quats": from_smallest_three((rotations >> 30).astype(np.intp), others),
-        "scales": within(sizes, ["scale_x", "scale_y", "scale_z"]).astype(np.float32),
-        "opacities": logits_of_bytes((vertices["packed_color"] & 255).astype(np.uint8))[:, None],
-        "sh0": ((rgb - 0.5) / SH_C0).astype(np.float32),
-        "shN": shN,
-    }
+        columns = [values[levels[name]] for name in splat_columns(sh_degree)["shN"]]
+        rows["shN"] = _by_coefficient(np.stack(columns, axis=1))
+    return rows
 
 
-def _parts(words: Uint32s, *bits: int) -> Float64s:
+def _table(path: StrPath, header: PlyHeader) -> NDArray[np.void]:
+    """The rows of an element of a binary file."""
+    return np.fromfile(path, header.dtype, header.count, offset=header.offset)
+
+
+def _for_each(bounds: Float32s, count: int) -> Float64s:
+    """The bounds ``[N, 3]`` of each splat from those of chunks."""
+    return bounds.repeat(_CHUNK, axis=0)[:count].astype(np.float64)
+
+
+def _unpacked(words: Uint32s, bits: Sequence[int]) -> Float64s:
     """Numbers of so many bits, the last one in the lowest, as shares of the largest ``[N, len(bits)]``."""
-    shifts = np.cumsum((0, *bits[:0:-1]))[::-1]
-    shares = [(words >> shift) % (1 << size) / ((1 << size) - 1) for size, shift in zip(bits, shifts, strict=True)]
-    return np.stack(shares, axis=1)
+    shares = np.empty((len(words), len(bits)))
+    for share, size in zip(shares.T[::-1], reversed(bits), strict=True):
+        share[:] = words % (1 << size) / ((1 << size) - 1)
+        words = words >> np.uint32(size)
+    return shares
 
 
 # The normals of points, which other programs expect, are 0 unless an attribute is called so.
@@ -388,14 +413,11 @@ def write_ply(path: StrPath, scene: CompressedScene) -> int:
     Returns:
         Bytes of the file.
     """
-    dims = attribute_dims(scene.sh_degree)
     with atomic_write(path) as file:
-        file.write(_header_text(len(scene), scene.sh_degree, scene.antialiased))
+        file.write(_header({"vertex": (len(scene), _plain_row(scene.sh_degree))}, scene.antialiased))
         for start in range(0, len(scene), _ROWS):
-            rows = slice(start, start + _ROWS)
-            # All red coefficients first; ours are [coefficient, channel].
-            values = {name: scene.values(name, rows).swapaxes(1 if name == "shN" else -1, -1) for name in dims}
-            columns = {name: values[name].reshape(len(values[name]), dim) for name, dim in dims.items()}
+            columns = {name: scene.rows(name, slice(start, start + _ROWS)) for name in ATTRIBUTES}
+            columns["shN"] = _by_color(columns["shN"])
             columns["unused"] = np.zeros((len(columns["means"]), len(_UNUSED)), np.float32)
             file.write(np.concatenate([columns[name] for name in _ORDER], axis=1).astype("<f4", copy=False).tobytes())
         return file.tell()
@@ -407,65 +429,59 @@ def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
     Returns:
         Bytes of the file.
     """
-    scene = in_morton_order(scene)
-    starts = np.arange(0, len(scene), 256)
+    scene = scene.in_morton_order()
+    starts = np.arange(0, len(scene), _CHUNK)
     bounds: dict[str, NDArray[Any]] = {}
 
     def shares(values: Float32s, names: Sequence[str]) -> Float64s:
-        """Shares of the ways from the smallest to the largest values of 256 splats ``[N, 3]``."""
-        low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
-        for end, values_of_end in (("min", low), ("max", high)):
-            bounds.update({f"{end}_{name}": values_of_end[:, axis] for axis, name in enumerate(names)})
-        low, high = (np.repeat(end, 256, axis=0)[: len(values)].astype(np.float64) for end in (low, high))
+        """Shares of the ways from the smallest to the largest values of the chunk, ``[N, 3]``."""
+        ends = {"min": np.minimum.reduceat(values, starts), "max": np.maximum.reduceat(values, starts)}
+        for end, bound in ends.items():
+            bounds.update({f"{end}_{name}": bound[:, axis] for axis, name in enumerate(names)})
+        low, high = (_for_each(bound, len(values)) for bound in ends.values())
         return (values - low) / np.where(high > low, high - low, 1)
 
-    largest, others = smallest_three(unit(scene.values("quats")))
-    colors = np.asarray(0.5 + SH_C0 * scene.values("sh0")[:, 0], np.float32)
-    words = {
-        "packed_position": _packed(shares(scene.means, "xyz"), 11, 10, 11),
-        "packed_rotation": _packed(others / math.sqrt(2) + 0.5, 10, 10, 10) | largest.astype(np.uint32) << 30,
-        "packed_scale": _packed(
-            shares(scene.values("scales").clip(-20, 20), ["scale_x", "scale_y", "scale_z"]), 11, 10, 11
-        ),
-        "packed_color": _packed(np.c_[shares(colors, "rgb"), opacity_of(scene.opacities)], 8, 8, 8, 8),
+    largest, others = smallest_three(unit(scene.rows("quats")))
+    colors = np.asarray(0.5 + SH_C0 * scene.rows("sh0"), np.float32)
+    parts = {
+        "packed_position": shares(scene.means, "xyz"),
+        "packed_rotation": others / math.sqrt(2) + 0.5,
+        "packed_scale": shares(scene.rows("scales").clip(-20, 20), _LENGTHS),
+        "packed_color": np.c_[shares(colors, "rgb"), opacity_of(scene.opacities)],
     }
-    levels = np.clip(32 * scene.values("shN") + 128, 0, 255).astype(np.uint8)
-    names = splat_columns(scene.sh_degree)["shN"]
-    sh = dict(zip(names, levels.swapaxes(1, 2).reshape(len(scene), len(names)).T, strict=True))
-    tables = {"chunk": bounds, "vertex": words, "sh": sh}
+    words = {name: _packed(parts[name], bits) for name, bits in _PACKED.items()}
+    words["packed_rotation"] |= largest.astype(np.uint32) << 30
+    tables = {"chunk": bounds, "vertex": words}
+    if scene.sh_degree:
+        levels = np.clip(32 * _by_color(scene.rows("shN")) + 128, 0, 255).astype(np.uint8)
+        tables["sh"] = dict(zip(splat_columns(scene.sh_degree)["shN"], levels.T, strict=True))
     elements = {}
     for name, table in tables.items():
-        if table:
-            dtype = [(column, rows.dtype.newbyteorder("<")) for column, rows in table.items()]
-            elements[name] = np.rec.fromarrays(list(table.values()), dtype=dtype)
-    return write_elements(path, elements, _comments(scene.antialiased))
+        columns = [(column, values.dtype) for column, values in table.items()]
+        elements[name] = np.rec.fromarrays(list(table.values()), dtype=columns)
+    return write_elements(path, elements, scene.antialiased)
 
 
-def write_elements(path: StrPath, elements: Mapping[str, NDArray[np.void]], comments: str = "") -> int:
+def write_elements(path: StrPath, elements: Mapping[str, NDArray[np.void]], antialiased: bool = False) -> int:
     """Write tables as little-endian ``.ply``.
 
     Args:
         path: File to write, replaced atomically.
         elements: Structured arrays ``[N]`` by the names of their elements; their fields are the properties.
-        comments: Lines of the header.
+        antialiased: Whether comments say that splats were trained with anti-aliasing.
 
     Returns:
         Bytes of the file.
     """
-    kinds = {code: name for name, code in reversed(_TYPES.items())}
-    head = f"ply\nformat binary_little_endian 1.0\n{comments}"
-    for name, rows in elements.items():
-        head += f"element {name} {len(rows)}\n"
-        head += "".join(f"property {kinds[rows.dtype[field].str[1:]]} {field}\n" for field in rows.dtype.names or ())
     with atomic_write(path) as file:
-        file.write(f"{head}end_header\n".encode("ascii"))
+        file.write(_header({name: (len(rows), rows.dtype) for name, rows in elements.items()}, antialiased))
         for rows in elements.values():
-            file.write(rows.tobytes())
+            file.write(rows.astype(rows.dtype.newbyteorder("<"), copy=False).tobytes())
         return file.tell()
 
 
-def _packed(shares: Float64s, *bits: int) -> Uint32s:
-    """Words ``[N]`` of shares ``[N, len(bits)]``, the last one in the lowest bits, as :func:`_parts` takes them."""
+def _packed(shares: Float64s, bits: Sequence[int]) -> Uint32s:
+    """Words ``[N]`` of shares ``[N, len(bits)]``, the last one in the lowest bits, as :func:`_unpacked` takes them."""
     words = np.zeros(len(shares), np.uint32)
     for share, size in zip(shares.T, bits, strict=True):
         words = words << np.uint32(size) | np.rint(share.clip(0, 1) * ((1 << size) - 1)).astype(np.uint32)
@@ -474,16 +490,23 @@ def _packed(shares: Float64s, *bits: int) -> Uint32s:
 
 def plain_ply_bytes(splats: int, sh_degree: int) -> int:
     """Size in bytes of the file that :func:`write_ply` makes: the reference for a compressed scene."""
-    header = _header_text(splats, sh_degree)
-    return len(header) + 4 * splats * header.count(b"property")
+    row = _plain_row(sh_degree)
+    return len(_header({"vertex": (splats, row)})) + splats * row.itemsize
 
 
-def _comments(antialiased: bool) -> str:
-    return "".join(f"comment {key} {value}\n" for key, value in _MIP_COMMENTS.items()) if antialiased else ""
-
-
-def _header_text(count: int, sh_degree: int, antialiased: bool = False) -> bytes:
+def _plain_row(sh_degree: int) -> np.dtype[np.void]:
+    """The row of a splat in a plain ``.ply``."""
     columns = splat_columns(sh_degree) | {"unused": _UNUSED}
-    properties = "".join(f"property float {column}\n" for name in _ORDER for column in columns[name])
-    head = f"ply\nformat binary_little_endian 1.0\n{_comments(antialiased)}element vertex {count}\n"
-    return f"{head}{properties}end_header\n".encode("ascii")
+    return np.dtype([(column, "<f4") for name in _ORDER for column in columns[name]])
+
+
+def _header(elements: Mapping[str, tuple[int, np.dtype[np.void]]], antialiased: bool = False) -> bytes:
+    """Header of a file with rows of elements, so many and of such a kind."""
+    kinds = {code: name for name, code in reversed(_TYPES.items())}
+    lines = ["ply", "format binary_little_endian 1.0"]
+    if antialiased:
+        lines += [f"comment {key} {value}" for key, value in _MIP_COMMENTS.items()]
+    for name, (count, row) in elements.items():
+        lines.append(f"element {name} {count}")
+        lines += [f"property {kinds[row[column].str[1:]]} {column}" for column in row.names or ()]
+    return "\n".join([*lines, "end_header\n"]).encode("ascii")

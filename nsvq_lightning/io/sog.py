@@ -35,9 +35,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
-from nsvq_lightning.io.compressed import CompressedScene, in_morton_order
-from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, check_room, naming_file, wrong_start
-from nsvq_lightning.io.numbers import logits_of_bytes, opacity_of
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, check_room, json_object, naming_file, wrong_start
+from nsvq_lightning.io.numbers import bytes_of, logits_of_bytes, opacity_of
 from nsvq_lightning.io.scalar_kmeans import nearest_level, scalar_kmeans
 from nsvq_lightning.splats.conventions import (
     Float32s,
@@ -90,13 +90,12 @@ def sog_contents(scene: CompressedScene, palette: int = PALETTE_LIMIT) -> dict[s
     low, high, means = _packed_means(scene.means)
     scales, scale_levels = _leveled(scene, "scales")
     colors, color_levels = _leveled(scene, "sh0")
-    opacities = np.rint(255 * opacity_of(scene.opacities)).astype(np.uint8)
     texels = {
         "means_l.webp": low,
         "means_u.webp": high,
-        "quats.webp": _packed_quats(scene.values("quats")),
+        "quats.webp": _packed_quats(scene.rows("quats")),
         "scales.webp": scales,
-        "sh0.webp": np.concatenate([colors, opacities[:, None]], axis=1),
+        "sh0.webp": np.c_[colors, bytes_of(scene.opacities)],
     }
     meta: dict[str, Any] = {
         "version": 2,
@@ -136,7 +135,7 @@ def write_sog(path: StrPath, scene: CompressedScene, *, palette: int = PALETTE_L
     Raises:
         ValueError: The palette has no rows or more than 65536.
     """
-    contents = sog_contents(in_morton_order(scene), palette)
+    contents = sog_contents(scene.in_morton_order(), palette)
     with atomic_write(path) as file:
         with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
             for name, data in contents.items():
@@ -167,13 +166,7 @@ class _Archive:
             self._zip = zipfile.ZipFile(io.BytesIO(data))
         except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError) as error:
             raise FormatError(f"truncated: no valid zip archive ({error})") from None
-        text = self._bytes(META, 1 << 20)
-        try:
-            self.meta = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise FormatError(f"damaged: {META} is not JSON ({error})") from None
-        if not isinstance(self.meta, dict):
-            raise FormatError(f"damaged: {META} is not a JSON object")
+        self.meta = json_object(self._bytes(META, 1 << 20), META)
         self.version = self.meta.get("version", 1)
         if self.version not in (1, 2):
             raise FormatError(f"version {str(self.version)[:40]} of the format; this release reads 1 and 2")
@@ -322,8 +315,7 @@ def _palette(scene: CompressedScene, most: int) -> tuple[Float32s, Int64s]:
     from nsvq_lightning.io.palette import find_palette, in_order_of_use  # imports Numba, which readers do without
 
     if "shN" not in scene.codes:
-        rows = scene.values("shN").reshape(len(scene), -1)
-        return in_order_of_use(*find_palette(rows, _visibility(scene), most))
+        return in_order_of_use(*find_palette(scene.rows("shN"), _visibility(scene), most))
     used, codes = np.unique(scene.codes["shN"], return_inverse=True)
     rows = scene.codebooks["shN"][used]
     if len(used) <= PALETTE_LIMIT:
@@ -337,7 +329,7 @@ def _visibility(scene: CompressedScene) -> Float64s:
 
     Every splat counts a little, however small it is compared with the largest.
     """
-    sizes = np.sort(scene.values("scales"), axis=1)[:, 1:].mean(1).astype(np.float64)
+    sizes = np.sort(scene.rows("scales"), axis=1)[:, 1:].mean(1).astype(np.float64)
     weight: Float64s = opacity_of(scene.opacities) * np.exp(sizes - sizes.max())
     return weight / float(weight.mean()) + 0.01
 
@@ -368,7 +360,7 @@ def _packed_quats(rows: Float32s) -> Uint8s:
 
 def _leveled(scene: CompressedScene, name: str) -> tuple[Uint8s, list[float]]:
     """Level indices ``[N, D]`` of an attribute, and the levels."""
-    values = scene.values(name).reshape(len(scene), -1)
+    values = scene.rows(name)
     levels = scalar_kmeans(values, count=_LEVELS)
     return nearest_level(values, levels), _decimals(levels)
 

@@ -18,7 +18,7 @@ import numpy as np
 from nsvq_lightning.io.atomic import StrPath, write_bytes
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, logs_of_lengths, opacity_of
+from nsvq_lightning.io.numbers import Clamped, bytes_of, logits_of_bytes, logs_of_lengths
 from nsvq_lightning.splats.conventions import SH_C0, Float32s, Uint8s, unit
 
 logger = logging.getLogger(__name__)
@@ -44,11 +44,11 @@ def write_splat(path: StrPath, scene: CompressedScene) -> int:
     records = np.empty(len(scene), _RECORD)
     records["means"] = scene.means
     # Between the smallest and the largest length that float32 holds with full precision.
-    records["lengths"] = np.exp(clamped.within("scales", scene.values("scales"), -87.0, 88.0))
-    colors = 255 * (0.5 + SH_C0 * scene.values("sh0")[:, 0])
+    records["lengths"] = np.exp(clamped.within("scales", scene.rows("scales"), -87.0, 88.0))
+    colors = 255 * (0.5 + SH_C0 * scene.rows("sh0"))
     records["colors"][:, :3] = clamped.nearest("sh0", colors, (0, 255))
-    records["colors"][:, 3] = np.rint(255 * opacity_of(scene.opacities))
-    records["quats"] = _packed_quats(scene.values("quats"))
+    records["colors"][:, 3] = bytes_of(scene.opacities)
+    records["quats"] = _packed_quats(scene.rows("quats"))
     clamped.warn(path, len(scene))
     write_bytes(path, records.tobytes())
     return records.nbytes
@@ -58,8 +58,7 @@ def _packed_quats(quats: Float32s) -> Uint8s:
     units = unit(quats)
     # Of q and -q, the one whose largest component is negative: -1 fits a byte, 1 does not.
     largest = np.take_along_axis(units, np.abs(units).argmax(1)[:, None], 1)
-    packed: Uint8s = np.rint(128 + 128 * np.where(largest > 0, -units, units)).astype(np.uint8)
-    return packed
+    return np.asarray(np.rint(128 + 128 * np.where(largest > 0, -units, units)), np.uint8)
 
 
 def read_splat(path: StrPath) -> CompressedScene:
@@ -74,10 +73,12 @@ def read_splat(path: StrPath) -> CompressedScene:
             raise FormatError(f"truncated, or not a .splat file: {len(data)} bytes are not whole splats of {each}")
     records = np.frombuffer(data, _RECORD)
     colors = records["colors"]
-    raw = {
-        "quats": ((records["quats"].astype(np.float32) - 128) / 128).astype(np.float32),
-        "scales": logs_of_lengths(records["lengths"]),
-        "sh0": ((colors[:, :3] / 255 - 0.5) / SH_C0).astype(np.float32),
-        "shN": np.zeros((len(records), 0), np.float32),
-    }
-    return CompressedScene(records["means"].astype(np.float32), logits_of_bytes(colors[:, 3]), raw=raw, sh_degree=0)
+    return CompressedScene.from_rows(
+        {
+            "means": records["means"],
+            "quats": (records["quats"].astype(np.float32) - 128) / 128,
+            "scales": logs_of_lengths(records["lengths"]),
+            "opacities": logits_of_bytes(colors[:, 3]),
+            "sh0": (colors[:, :3] / 255 - 0.5) / SH_C0,
+        }
+    )

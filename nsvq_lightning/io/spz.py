@@ -42,9 +42,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
-from nsvq_lightning.io.compressed import UP_AXES, CompressedScene, in_morton_order, rotated
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, check_room, naming_file, wrong_start
-from nsvq_lightning.io.numbers import Clamped, logits_of_bytes, opacity_of
+from nsvq_lightning.io.numbers import Clamped, bytes_of, logits_of_bytes
+from nsvq_lightning.io.placing import UP_AXES, rotated
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import attribute_dims
 from nsvq_lightning.splats.conventions import Float32s, Uint8s, Uint32s
@@ -94,7 +95,7 @@ _HEAD = _HEADER.size + _TABLE_OFFSET.size
 # Compressed and uncompressed bytes of a stream.
 _ENTRY = struct.Struct("<QQ")
 # Bytes of extensions that are read; those in use have less than a hundred.
-_MOST_EXTENDED = 1 << 20
+_MAX_EXTENDED = 1 << 20
 # The flags of a scene that was trained with anti-aliasing, and of extensions.
 ANTIALIASED, _EXTENDED = 1, 2
 # Type and length, then the number of the axes.
@@ -225,9 +226,9 @@ def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
         if len(contents[name]) < size:
             raise FormatError(f"truncated: {name} of {header.count} splats has {len(contents[name])} of {size} bytes")
     # Extensions follow the arrays; reading to the end of the stream verifies its checksum.
-    extensions = _inflate(gunzip, gunzip.unconsumed_tail, _MOST_EXTENDED)
+    extensions = _inflate(gunzip, gunzip.unconsumed_tail, _MAX_EXTENDED)
     if not gunzip.eof:
-        raise FormatError(f"truncated, or more than {_MOST_EXTENDED} bytes of extensions: the gzip stream has no end")
+        raise FormatError(f"truncated, or more than {_MAX_EXTENDED} bytes of extensions: the gzip stream has no end")
     return _with_axes(header, extensions), contents
 
 
@@ -240,7 +241,7 @@ def _inflate(gunzip: "zlib._Decompress", data: bytes, most: int) -> bytes:
 
 
 # Bits of a position, and the largest number of them that are fractional.
-_POSITION, MOST_FRACTION = 24, 30
+_POSITION, MAX_FRACTION = 24, 30
 
 
 def _parse(start: bytes, file_bytes: int) -> SpzHeader:
@@ -252,8 +253,8 @@ def _parse(start: bytes, file_bytes: int) -> SpzHeader:
         raise FormatError(f"version {version} of the format; this release reads 1 to 4", "save it as version 3 or .ply")
     if sh_degree > 4:
         raise FormatError(f"damaged: SH degree {sh_degree}, not 0 to 4")
-    if fraction_bits > MOST_FRACTION:
-        raise FormatError(f"damaged: {fraction_bits} fractional bits, more than {MOST_FRACTION}")
+    if fraction_bits > MAX_FRACTION:
+        raise FormatError(f"damaged: {fraction_bits} fractional bits, more than {MAX_FRACTION}")
     check_room("splats", count, file_bytes)
     return SpzHeader(version, count, sh_degree, fraction_bits, flags)
 
@@ -276,7 +277,7 @@ def in_spz_order(scene: CompressedScene) -> CompressedScene:
 
     The codes of the spherical harmonics come first: in both versions, equal rows compress best when close together.
     """
-    scene = in_morton_order(scene)
+    scene = scene.in_morton_order()
     codes = [scene.codes[name] for name in ("quats", "scales", "sh0", "shN") if name in scene.codes]  # shN sorts first
     return scene.take(np.lexsort([np.arange(len(scene)), *codes]))
 
@@ -320,7 +321,6 @@ def write_spz(
     scene = in_spz_order(scene)
     clamped = Clamped()
     xyz, quats, harmonics = _signs(axes.upper(), scene.sh_degree)
-    flags = ANTIALIASED * scene.antialiased
     fraction = _fraction_bits(scene)
     # Viewers expect version 3 to be silent, in the default axes; Babylon.js turns a scene that says so upside down.
     stated = axes.upper() if version == 4 or axes != DEFAULT_AXES else ""
@@ -328,13 +328,14 @@ def write_spz(
     means = clamped.nearest("means", scene.means * xyz * (1 << fraction), (-end, end - 1))
     arrays: dict[str, NDArray[Any]] = {
         "means": means.astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3],
-        "opacities": np.rint(255 * opacity_of(scene.opacities)).astype(np.uint8),
+        "opacities": bytes_of(scene.opacities),
         "sh0": _packed(scene, "sh0", _COLOR * 255, 127.5, clamped),
         "scales": _packed(scene, "scales", 16, 160, clamped),
-        "quats": _packed_quats(scene.values("quats") * quats),
+        "quats": _packed_quats(scene.rows("quats") * quats),
         "shN": _packed(scene, "shN", 128 * harmonics, 128, clamped),
     }
     clamped.warn(path, len(scene))
+    flags = ANTIALIASED * scene.antialiased
     return _write_frame(path, SpzHeader(version, len(scene), scene.sh_degree, fraction, flags, stated), arrays)
 
 
@@ -346,20 +347,19 @@ def _fraction_bits(scene: CompressedScene) -> int:
 
     A few distant splats do not make positions coarser than the format's usual 12 bits; they are clamped.
     """
-    sizes = scene.values("scales").mean(1)
+    sizes = scene.rows("scales").mean(1)
     # No coordinate is off by more than a twentieth of the splat's size, but for the smallest thousandth of the splats.
     needed = math.ceil(-(math.log2(2 * 0.05) + float(np.quantile(sizes, 0.001)) / math.log(2)))
     farthest, far = np.abs(scene.means).max(), np.quantile(np.abs(scene.means).max(1), 0.999)
     fits, mostly_fits = (_POSITION - 1 - math.frexp(float(reach))[1] for reach in (farthest, far))
-    return min(max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0), MOST_FRACTION)
+    return min(max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0), MAX_FRACTION)
 
 
 def _packed(scene: CompressedScene, name: str, factor: float | Float32s, zero: float, clamped: Clamped) -> Uint8s:
     found = np.empty((len(scene), attribute_dims(scene.sh_degree)[name]), np.uint8)
     for start in range(0, len(scene), 1 << 16):  # so that temporary arrays stay small
         block = slice(start, start + (1 << 16))
-        rows = scene.values(name, block)
-        found[block] = clamped.nearest(name, factor * rows.reshape(len(rows), -1) + zero, (0, 255))
+        found[block] = clamped.nearest(name, factor * scene.rows(name, block) + zero, (0, 255))
     return found
 
 
@@ -397,17 +397,16 @@ def read_spz(path: StrPath) -> CompressedScene:
     if turn:  # z is up or down: signs first, then a quarter turn, as Niantic's library does it, which writes such files
         axes = axes[0] + axes[2] + {"F": "B", "B": "F"}[axes[1]]
     xyz, quats, harmonics = _signs(axes, degree)
-    scene = CompressedScene(
-        means=(_unpacked_means(header, arrays["means"]) * xyz).astype(np.float32),
-        opacities=logits_of_bytes(arrays["opacities"][:, 0]),
-        raw={
+    scene = CompressedScene.from_rows(
+        {
+            "means": _unpacked_means(header, arrays["means"]) * xyz,
             "quats": _unpacked_quats(header, arrays["quats"]) * quats,
-            "scales": (arrays["scales"] / 16 - 10).astype(np.float32),
-            "sh0": ((arrays["sh0"] / 255 - 0.5) / _COLOR).astype(np.float32),
-            "shN": ((arrays["shN"][:, : len(harmonics)].astype(np.float32) - 128) / 128 * harmonics).astype(np.float32),
+            "scales": arrays["scales"] / 16 - 10,
+            "opacities": logits_of_bytes(arrays["opacities"]),
+            "sh0": (arrays["sh0"] / 255 - 0.5) / _COLOR,
+            "shN": (arrays["shN"][:, : len(harmonics)].astype(np.float32) - 128) / 128 * harmonics,
         },
-        sh_degree=degree,
-        config={"antialiased": True} if header.flags & ANTIALIASED else {},
+        antialiased=bool(header.flags & ANTIALIASED),
     )
     return rotated(scene, UP_AXES["z"]) if turn else scene
 

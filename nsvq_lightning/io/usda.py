@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
-from nsvq_lightning.io.compressed import HALF_TURN, UP_AXES, CompressedScene, moved, rotated
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
 from nsvq_lightning.io.numbers import logits_of, logs_of_lengths, opacity_of
-from nsvq_lightning.splats.conventions import Float32s, Float64s, sh_coefficients, shN_degree, unit
+from nsvq_lightning.io.placing import HALF_TURN, UP_AXES, moved, rotated
+from nsvq_lightning.splats.conventions import Float32s, Float64s, sh_coefficients, unit
 
 log = logging.getLogger(__name__)
 
@@ -31,12 +32,12 @@ def write_usda(path: StrPath, scene: CompressedScene) -> int:
         Bytes of the file.
     """
     scene = rotated(scene, HALF_TURN)
-    colors = np.concatenate([scene.values("sh0"), scene.values("shN")], axis=1)
+    colors = np.concatenate([scene.rows("sh0"), scene.rows("shN")], axis=1)
     per_splat = sh_coefficients(scene.sh_degree) + 1
     arrays: list[tuple[str, NDArray[np.floating], str]] = [
         ("point3f[] positions", scene.means, ""),
-        ("quatf[] orientations", unit(scene.values("quats")), ""),
-        ("float3[] scales", np.exp(scene.values("scales").astype(np.float64)), ""),
+        ("quatf[] orientations", unit(scene.rows("quats")), ""),
+        ("float3[] scales", np.exp(scene.rows("scales").astype(np.float64)), ""),
         ("float[] opacities", opacity_of(scene.opacities)[:, None], ""),
         (
             f"float3[] {_COEFFICIENTS}",
@@ -88,15 +89,17 @@ def read_usda(path: StrPath) -> CompressedScene:
             raise FormatError("it has transforms (xformOp), which are not read", "export it anew, flattened")
         if ".timeSamples" in text:
             log.warning("%s changes with time: the first sample is read", path)
-        means, opacities = _rows(text, "positions", 3), _rows(text, "opacities", 1)
-        scales, quats = _rows(text, "scales", 3), _rows(text, "orientations", 4)
+        rows = {
+            "means": _rows(text, "positions", 3),
+            "opacities": logits_of(_rows(text, "opacities", 1)),
+            "scales": logs_of_lengths(_rows(text, "scales", 3)),
+            "quats": _rows(text, "orientations", 4),
+        }
         colors = _rows(text, _COEFFICIENTS, 3)
-        config = {"antialiased": True} if "bool antialiased = 1" in text else {}
         try:
-            colors = colors.reshape(len(means), -1)
-            degree = shN_degree(colors.shape[1] // 3 - 1)
-            raw = {"quats": quats, "scales": logs_of_lengths(scales), "sh0": colors[:, :3], "shN": colors[:, 3:]}
-            scene = CompressedScene(means, logits_of(opacities[:, 0]), raw=raw, sh_degree=degree, config=config)
+            colors = colors.reshape(len(rows["means"]), -1)
+            rows |= {"sh0": colors[:, :3], "shN": colors[:, 3:]}
+            scene = CompressedScene.from_rows(rows, antialiased="bool antialiased = 1" in text)
             return moved(scene, _to_ours(text))
         except ValueError as error:
             raise FormatError(f"truncated or damaged: {error}") from None

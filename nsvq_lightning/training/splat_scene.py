@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.compression.stored import to_compressed
-from nsvq_lightning.io.compressed import CompressedScene, placed
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.placing import placed
 from nsvq_lightning.quantize.attributes import attribute_rows, decoded
 from nsvq_lightning.quantize.codebook import Quantizer
 from nsvq_lightning.rendering.camera import Camera

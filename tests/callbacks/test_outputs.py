@@ -12,8 +12,9 @@ from nsvq_lightning.callbacks import LiveScene, PhaseSchedule
 from nsvq_lightning.callbacks import outputs as live_callback
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io import load
-from nsvq_lightning.io.compressed import CompressedScene, placed
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.header import read_header
+from nsvq_lightning.io.placing import placed
 from nsvq_lightning.report.viewer import LIVE_SCENE, REQUEST, ask_live
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from nsvq_lightning.io.compressed import CompressedScene, placed
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.placing import placed
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT, Frame, reach_of

@@ -346,8 +346,7 @@ _INTEGER_CONTEXTS = 2 << _LENGTH_BITS
 
 def _bit_lengths(values: Int64s) -> Int64s:
     """Bit length of each absolute value; 0 for 0."""
-    exponents: Int64s = np.frexp(np.abs(values).astype(np.float64))[1].astype(np.int64)
-    return exponents
+    return np.frexp(np.abs(values).astype(np.float64))[1].astype(np.int64)
 
 
 @partial(kernel, allocates=False)

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.io import CompressedScene, FormatError, read_header, read_nsvq, write_nsvq
-from nsvq_lightning.io.compressed import rotated
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import encode
 from nsvq_lightning.io.nsvq.precision import OPACITY_ERRORS, Precision, Storage
+from nsvq_lightning.io.placing import rotated
 
 
 def matched(original: SimpleNamespace, back: SimpleNamespace) -> NDArray[np.intp]:

@@ -26,11 +26,12 @@ from nsvq_lightning.callbacks import (
 from nsvq_lightning.compute.devices import AsyncScalar
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.images import read_image
-from nsvq_lightning.io.compressed import CompressedScene, placed
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import load
 from nsvq_lightning.io.nsvq.file import read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.header import read_header
 from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.io.placing import placed
 from nsvq_lightning.quantize import NSVQ, PostHoc, StraightThrough
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.training.module import SplatModule

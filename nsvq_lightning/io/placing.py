@@ -1,0 +1,104 @@
+"""Scenes turned, scaled and moved, by the rows of their codebooks."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.splats.conventions import Float32s, Float64s, turned
+
+if TYPE_CHECKING:
+    from nsvq_lightning.rendering.frame import Frame
+
+# Rotations that turn COLMAP's up, -y, to an axis; x stays.
+UP_AXES = {
+    "y": np.diag([1.0, -1.0, -1.0]),
+    "minus-y": np.eye(3),
+    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "minus-z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+}
+
+
+def turn_up(up: Float64s, axis: str) -> Float64s:
+    """The rotation ``[3, 3]`` that turns a direction to an axis: the shortest way to -y, then around x.
+
+    Args:
+        up: Direction ``[3]`` of length 1.
+        axis: One of :data:`UP_AXES`.
+    """
+    goal = np.array([0.0, -1.0, 0.0])
+    # Two reflections: one that swaps opposite directions needs another mirror than the one between them.
+    between = up + goal
+    if between @ between < 1e-12:
+        return np.asarray(UP_AXES[axis] @ UP_AXES["y"])
+    first, second = (np.eye(3) - 2 * np.outer(v, v) / (v @ v) for v in (goal, between))
+    return np.asarray(UP_AXES[axis] @ first @ second)
+
+
+# Half around z: right, down, front becomes left, up, front, the axes of glTF and USD.
+HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+
+
+def rotated(scene: CompressedScene, rotation: Float64s) -> CompressedScene:
+    """The scene turned about the world's origin by a rotation ``[3, 3]``, see :func:`moved`."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    return moved(scene, matrix)
+
+
+def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
+    """The scene turned, scaled and moved.
+
+    Positions, scales, rotations and spherical harmonics change, the last three by the rows of their codebooks; numbers
+    are rounded once, to float32.
+
+    Args:
+        scene: The scene.
+        matrix: From old to new world coordinates ``[4, 4]``: a rotation times a positive number, and a translation.
+
+    Raises:
+        ValueError: It stretches, mirrors or is not finite.
+    """
+    import torch
+
+    from nsvq_lightning.rendering.sh import sh_rotation
+
+    linear, shift = matrix[:3, :3], matrix[:3, 3]
+    size = float(np.cbrt(np.linalg.det(linear)))
+    if not (
+        np.isfinite(matrix).all()
+        and size > 0
+        and np.allclose(linear @ linear.T, size**2 * np.eye(3), 0, 1e-5 * size**2)
+    ):
+        raise ValueError(
+            f"{linear.tolist()} is no rotation times a number: splats can be turned and scaled evenly only"
+        )
+    rotation = linear / size
+    harmonics = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
+
+    def turned_harmonics(rows: Float32s) -> Float64s:
+        coefficients = rows.reshape(len(rows), len(harmonics), 3).astype(np.float64)
+        return np.asarray((harmonics @ coefficients).reshape(rows.shape))
+
+    has_origin = any(scene.origin)
+    means = scene.means.astype(np.float64) @ linear.T + (0 if has_origin else shift)
+    origin = linear @ np.array(scene.origin) + (shift if has_origin else 0)
+    return scene.changed(
+        {
+            "scales": lambda rows: rows + np.log(size),
+            "quats": lambda rows: turned(rows, rotation),
+            "shN": turned_harmonics,
+        },
+        means=means.astype(np.float32),
+        origin=tuple(origin.tolist()),
+    )
+
+
+def placed(scene: CompressedScene, frame: "Frame") -> CompressedScene:
+    """The scene in the coordinates of its files, from those of the frame that it was trained in."""
+    means = frame.unit * scene.means.astype(np.float64) + frame.middle
+    return scene.changed(
+        {"scales": lambda rows: rows + np.log(frame.unit)},
+        means=means.astype(np.float32),
+        origin=frame.origin,
+    )

@@ -1,0 +1,83 @@
+"""Turned and moved scenes look as before from where the cameras have gone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from compressed_scenes import on_basis
+from compressed_scenes import scene as coded
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from nsvq_lightning.compression.viewpoints import look_at
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.placing import UP_AXES, rotated, turn_up
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.poses import up_of
+from nsvq_lightning.rendering.rasterize import render
+from tests.support.splat_scenes import ball
+
+
+def picture(scene: CompressedScene, camera: Camera) -> torch.Tensor:
+    splats = scene.decode().double().raw()
+    world = splats._replace(means=splats.means + torch.tensor(scene.origin))
+    with torch.no_grad():
+        return render(world, camera, backend="reference").image
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("kind", ["codebooks", "plain", "basis"])
+def test_a_turned_scene_is_the_same_scene(degree: int, kind: str) -> None:
+    plain = replace(ball(200, degree), origin=(0.5, -1.0, 2.0))
+    sizes = {"scales": 9, "quats": 7, "sh0": 8} | ({"shN": 6} if degree else {})
+    scene = coded(200, sizes, degree, origin=(0.5, -1.0, 2.0)) if kind == "codebooks" else plain
+    if kind == "basis" and degree:
+        scene = on_basis(plain)
+    rotation = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    turned = rotated(scene, rotation)
+    assert [len(rows) for rows in turned.codebooks.values()] == [len(rows) for rows in scene.codebooks.values()]
+    if scene.bases:
+        expanded = replace(scene, raw={name: scene.rows(name) for name in scene.raw}, bases={})
+        np.testing.assert_allclose(turned.values("shN"), rotated(expanded, rotation).values("shN"), rtol=0, atol=1e-6)
+        np.testing.assert_array_equal(turned.raw["shN"], scene.raw["shN"])
+    middle = np.array(scene.origin)
+    before = look_at(middle, middle + np.array([1.0, 2.0, -6.0]), 60, 40, 0.9)
+    back = np.eye(4)
+    back[:3, :3] = rotation.T
+    after = Camera(before.K, torch.from_numpy(before.viewmat.double().numpy() @ back), 60, 40)
+    expected = picture(scene, before)
+    assert expected.std() > 0.01
+    torch.testing.assert_close(picture(turned, after), expected, rtol=0, atol=2e-5)
+
+
+def cameras_with_up(up: NDArray[np.float64], roll: float = 0.0) -> list[Camera]:
+    """Level cameras around a vertical axis, looking a little down, every fifth in portrait format."""
+    lift = np.linalg.inv(turn_up(up, "minus-y"))
+    made = []
+    for number, angle in enumerate(np.linspace(0, 5, 20)):
+        camera = look_at(np.zeros(3), np.array([4 * np.cos(angle), -1.5, 4 * np.sin(angle)]), 40, 30, 0.9)
+        view = camera.viewmat.double().numpy()
+        view[:3, :3] = view[:3, :3] @ lift.T
+        quarter = Rotation.from_rotvec([0, 0, np.pi / 2 * (number % 5 == 0) + roll]).as_matrix()
+        view[:3] = quarter @ view[:3]
+        made.append(Camera(camera.K, torch.from_numpy(view), 40, 30))
+    return made
+
+
+@pytest.mark.parametrize("axis", UP_AXES)
+@pytest.mark.parametrize("up", [[0.0, -1, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8], [1e-9, 1, 0]])
+def test_up_becomes_the_axis(axis: str, up: list[float]) -> None:
+    direction = np.array(up) / np.linalg.norm(up)
+    rotation = turn_up(direction, axis)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    expected = {"y": [0, 1, 0], "minus-y": [0, -1, 0], "z": [0, 0, 1], "minus-z": [0, 0, -1]}[axis]
+    np.testing.assert_allclose(rotation @ direction, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("up", [[0.0, -1, 0], [0, 0, 1], [0.36, -0.48, 0.8]])
+def test_up_is_where_most_cameras_hold_it(up: list[float]) -> None:
+    np.testing.assert_allclose(up_of(cameras_with_up(np.array(up))), up, atol=0.02)
