@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from lightning.pytorch import Callback, Trainer
 
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.report.files import file_stem
+from nsvq_lightning.report.pictures import file_stem
 from nsvq_lightning.training import row_ops
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import hold, is_fast_dev_run, let_go, run_folder

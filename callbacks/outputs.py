@@ -17,7 +17,7 @@ from nsvq_lightning.io.formats import FORMATS, save
 from nsvq_lightning.io.nsvq.file import as_stored
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.io.placing import placed
-from nsvq_lightning.report import files, viewer
+from nsvq_lightning.report import pictures, viewer
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 from nsvq_lightning.training.run_scene import scene_of
@@ -96,7 +96,7 @@ class RenderWriter(BasePredictionWriter):
         """Write one picture."""
         if is_fast_dev_run(trainer):
             return
-        files.write_png(picture_file(trainer, self._target, prediction["name"]), prediction["image"])
+        pictures.write_png(picture_file(trainer, self._target, prediction["name"]), prediction["image"])
 
     def on_predict_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Say where the pictures are."""

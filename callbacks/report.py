@@ -18,7 +18,7 @@ from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
-from nsvq_lightning.report import files, page
+from nsvq_lightning.report import numbers, page, pictures
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 from nsvq_lightning.training.stopwatch import TimesBeside
@@ -117,9 +117,9 @@ class MetricReport(WritingCallback):
         if trainer.is_global_zero and module.history and not is_fast_dev_run(trainer):
             with module.stopwatch.paused(module.device):
                 with optional(folder / "curve.csv"):
-                    files.write_csv(folder / "curve.csv", module.history)
+                    numbers.write_csv(folder / "curve.csv", module.history)
                 with optional(folder / "curve.png"):
-                    files.write_figure(folder / "curve.png", files.curve_figure(module.history, module.schedule))
+                    pictures.write_figure(folder / "curve.png", pictures.curve_figure(module.history, module.schedule))
 
     def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Catch up for a run that was stopped after its last iteration: when continued, it trains no further."""
@@ -146,9 +146,9 @@ class MetricReport(WritingCallback):
         def show(image: Tensor, photo: Tensor) -> None:
             if self.pictures and trainer.is_global_zero:
                 with optional(folder / "preview.png"):
-                    files.write_png(folder / "preview.png", torch.cat([eight_bit(photo), image], dim=1))
+                    pictures.write_png(folder / "preview.png", torch.cat([eight_bit(photo), image], dim=1))
 
-        mean_psnr, mean_ssim = files.evaluate(
+        mean_psnr, mean_ssim = numbers.evaluate(
             lambda camera: module.scene.render(splats, camera).image, views, module.device, show
         )
         entry: dict[str, Any] = {
@@ -162,7 +162,7 @@ class MetricReport(WritingCallback):
         module.history.append(entry)
         if trainer.is_global_zero:
             with optional(folder / "curve.csv"):
-                files.write_csv(folder / "curve.csv", module.history)
+                numbers.write_csv(folder / "curve.csv", module.history)
             with optional(folder / page.NAME):
                 page.write_page(folder, module.history, module.schedule, self._beside.seconds())
         values = {f"report/{name}": float(entry[name]) for name in ("psnr", "ssim", "splats")}
@@ -182,7 +182,7 @@ class MetricReport(WritingCallback):
             if trainer.is_global_zero:
                 scene = module.compressed()
                 save(scene, path, module.storage)
-                self._paper_level = files.paper_level(scene)
+                self._paper_level = numbers.paper_level(scene)
             trainer.strategy.barrier("scene.nsvq")
             self._scene = read_nsvq(path)
         # Detached tensors, not the module: a submodule would enter checkpoints.
@@ -210,7 +210,7 @@ class MetricReport(WritingCallback):
             path = picture_file(trainer, run_folder(trainer) / "renders", batch.name)
             with optional(path):
                 path.parent.mkdir(exist_ok=True)
-                files.write_png(path, files.comparison(image, photo))
+                pictures.write_png(path, pictures.comparison(image, photo))
 
     def on_test_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the figures."""
@@ -225,16 +225,16 @@ class MetricReport(WritingCallback):
         if trainer.is_global_zero and scores:
             folder = run_folder(trainer)
             lpips = None if self._lpips is None else fmean(score["lpips"] for score in scores), self._lpips_reason
-            metrics = files.summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper_level)
+            metrics = numbers.summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper_level)
             with optional(folder / "metrics.json"):
-                files.write_metrics(folder / "metrics.json", metrics)
+                numbers.write_metrics(folder / "metrics.json", metrics)
             with optional(folder / "views.csv"):
-                files.write_csv(folder / "views.csv", scores)
+                numbers.write_csv(folder / "views.csv", scores)
             paths = [picture_file(trainer, folder / "renders", score["name"]) for score in scores]
             views = [score | {"picture": path.name} for score, path in zip(scores, paths, strict=True)]
             with optional(folder / page.NAME):
                 told = module.history, module.schedule, self._beside.seconds(), metrics, views
                 log.info("report: %s", page.write_page(folder, *told))
             if self.pictures:
-                files.log_pictures(trainer.loggers, [path for path in paths if path.exists()], trainer.global_step)
+                pictures.log_pictures(trainer.loggers, [path for path in paths if path.exists()], trainer.global_step)
         self._scene, self._lpips = None, None

@@ -25,8 +25,7 @@ from tqdm import tqdm
 from nsvq_lightning.commands.arguments import views_of
 from nsvq_lightning.commands.compress import VIEWS, share_or_number, splats_left
 from nsvq_lightning.io import formats, lod, placing, spz
-from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.describe import attribute_errors
+from nsvq_lightning.io.compressed import CompressedScene, attribute_errors
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.sog import PALETTE_LIMIT
 from nsvq_lightning.splats.conventions import Float64s
@@ -166,7 +165,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     from nsvq_lightning.compression.importance import floaters
     from nsvq_lightning.data.scene import View, load_scene
     from nsvq_lightning.rendering.rasterize import render
-    from nsvq_lightning.report.files import evaluate
+    from nsvq_lightning.report.numbers import evaluate
 
     photos = load_scene(root)
     splats = scene.decode().raw()

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.io.describe import describe
+from nsvq_lightning.io.formats import describe
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     from nsvq_lightning.compute.devices import best_device
     from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.rendering.rasterize import render
-    from nsvq_lightning.report.files import VIDEO, frame_writer
+    from nsvq_lightning.report.pictures import VIDEO, frame_writer
 
     file = scene_file(options.scene)
     output = options.output or file.with_name("render.mp4")

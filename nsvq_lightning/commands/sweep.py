@@ -325,7 +325,7 @@ def write_results(output: Path, rows: Sequence[Row]) -> None:
     Those that differ in the seed alone are a line of the table, with mean and standard deviation, and a point of the
     picture with whiskers. That has a panel for each scene, and a curve for each configuration and quantizer.
     """
-    from nsvq_lightning.report import files
+    from nsvq_lightning.report import numbers, pictures
 
     groups: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
@@ -339,14 +339,14 @@ def write_results(output: Path, rows: Sequence[Row]) -> None:
             plus_minus = f" ± {spread:{form}}" if len(group) > 1 else ""
             line.append("–" if np.isnan(mean) else f"{mean:{form}}{plus_minus}")
         lines.append(line)
-    text = f"# nsvq sweep\n\n{files.markdown_table([*NAMES, 'runs', *TABLE], lines, words=NAMES)}\n\n"
+    text = f"# nsvq sweep\n\n{numbers.markdown_table([*NAMES, 'runs', *TABLE], lines, words=NAMES)}\n\n"
     text += "Mean ± standard deviation over the seeds. PSNR (dB) and SSIM are of the decoded file on the test views, "
     text += "psnr_before of the plain splats.\n"
     failed = ["* {scene}, {config}, {codebooks}, seed {seed}: {error}\n".format(**row) for row in rows if row["error"]]
-    files.write_csv(output / "results.csv", rows)
+    numbers.write_csv(output / "results.csv", rows)
     write_text(output / "results.md", text + "".join(["\nFailed:\n\n", *failed] if failed else failed))
     if groups:
-        files.write_figure(output / "results.png", figure(list(groups.values())))
+        pictures.write_figure(output / "results.png", figure(list(groups.values())))
 
 
 def moments(rows: Sequence[Row], column: str) -> tuple[float, float]:
@@ -362,7 +362,7 @@ def figure(groups: Sequence[Sequence[Row]]) -> Any:
     Args:
         groups: Runs that differ in the seed alone.
     """
-    from nsvq_lightning.report.files import new_figure
+    from nsvq_lightning.report.pictures import new_figure
 
     curves: dict[str, dict[str, list[Sequence[Row]]]] = {}
     for group in groups:

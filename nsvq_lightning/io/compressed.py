@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.numbers import opacity_of
 from nsvq_lightning.splats import attributes as splat
-from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, shN_degree
+from nsvq_lightning.splats.conventions import Arrays, Bools, Float32s, Float64s, Integers, shN_degree, unit
 
 if TYPE_CHECKING:
     from nsvq_lightning.splats.splats import Splats, SplatTensors
@@ -48,7 +48,7 @@ class CompressedScene:
 
     means: Float32s
     opacities: Float32s
-    codes: Mapping[str, NDArray[np.integer]] = field(default_factory=dict)
+    codes: Mapping[str, Integers] = field(default_factory=dict)
     codebooks: Mapping[str, Float32s] = field(default_factory=dict)
     raw: Mapping[str, Float32s] = field(default_factory=dict)
     sh_degree: int = 3
@@ -100,7 +100,7 @@ class CompressedScene:
         )
 
     @classmethod
-    def from_rows(cls, rows: Mapping[str, NDArray[Any]], antialiased: bool = False, **header: Any) -> "CompressedScene":
+    def from_rows(cls, rows: Mapping[str, Arrays], antialiased: bool = False, **header: Any) -> "CompressedScene":
         """N splats without any codebook, as most formats hold them.
 
         Args:
@@ -206,7 +206,7 @@ class CompressedScene:
             *(torch.from_numpy(np.ascontiguousarray(self.values(name))) for name in splat.ATTRIBUTES)
         )
 
-    def take(self, splats: NDArray[np.integer] | Bools) -> "CompressedScene":
+    def take(self, splats: Integers | Bools) -> "CompressedScene":
         """The scene of some of the splats, by index or by mask ``[N]``; codebooks stay as they are."""
         return replace(
             self,
@@ -272,7 +272,7 @@ class CompressedScene:
         log.warning(splat.dropped(keep, culprits))
         return self.take(keep)
 
-    def changed(self, changes: Mapping[str, Callable[[Float32s], NDArray[Any]]], **fields: Any) -> "CompressedScene":
+    def changed(self, changes: Mapping[str, Callable[[Float32s], Arrays]], **fields: Any) -> "CompressedScene":
         """The scene with other values of attributes, by the rows of their codebooks or bases where they have those.
 
         Args:
@@ -321,7 +321,7 @@ def _check_floats(name: str, array: Float32s, shape: tuple[int, ...]) -> None:
         raise TypeError(f"{name} must be float32, got {array.dtype}; convert it with .astype(np.float32)")
 
 
-def _check_codes(name: str, codes: NDArray[np.integer], codebook: Float32s, n: int, dim: int) -> None:
+def _check_codes(name: str, codes: Integers, codebook: Float32s, n: int, dim: int) -> None:
     if dim == 0:
         raise ValueError(
             f"{name} has no coefficients at SH degree 0, so no codebook; give it in raw with shape [{n}, 0]"
@@ -336,3 +336,31 @@ def _check_codes(name: str, codes: NDArray[np.integer], codebook: Float32s, n: i
         raise ValueError(f"codebooks[{name!r}] is empty; a codebook needs at least one row")
     if n and not (int(codes.min()) >= 0 and int(codes.max()) < rows):
         raise ValueError(f"codes[{name!r}] must be in 0..{rows - 1}, got {codes.min()}..{codes.max()}")
+
+
+def attribute_errors(read: CompressedScene, written: CompressedScene) -> dict[str, float]:
+    """Root mean square errors over the splats, by quantity.
+
+    Args:
+        read: What the file holds, N splats.
+        written: What it was written from, the same splats in the same order; spherical-harmonic coefficients that
+            the file does not hold count as 0.
+
+    Returns:
+        ``position`` in scene units, ``rotation`` in degrees, ``log-scale``, ``opacity`` in [0, 1], and the coefficients
+        ``sh0`` and ``shN``; 0 where there is nothing to compare.
+    """
+    read = read.with_degree(written.sh_degree)
+    differences = {name: read.rows(name) - written.rows(name).astype(np.float64) for name in splat.ATTRIBUTES}
+    units = unit(read.rows("quats"))
+    others = unit(written.rows("quats"))
+    nearer = np.minimum(np.linalg.norm(units - others, axis=1), np.linalg.norm(units + others, axis=1))
+    errors = {
+        "position": differences["means"],
+        "rotation": np.degrees(4 * np.arcsin(np.minimum(nearer / 2, 1))),
+        "log-scale": differences["scales"],
+        "opacity": opacity_of(read.opacities) - opacity_of(written.opacities),
+        "sh0": differences["sh0"],
+        "shN": differences["shN"],
+    }
+    return {name: float(np.sqrt(np.mean(np.square(error)))) if error.size else 0.0 for name, error in errors.items()}

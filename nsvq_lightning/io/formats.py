@@ -1,4 +1,4 @@
-"""Load and save scenes of any format: the end of the file's name selects it."""
+"""Scene files of any format: the end of the file's name selects it."""
 
 import logging
 from collections.abc import Callable
@@ -13,6 +13,7 @@ from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import naming_file
 from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_nsvq
+from nsvq_lightning.io.nsvq.header import describe_nsvq
 from nsvq_lightning.io.nsvq.precision import Storage
 
 if TYPE_CHECKING:
@@ -113,6 +114,29 @@ def save(
     elif storage is not None:
         scene = as_stored(scene, storage)
     return entry.write(path, scene, **options)
+
+
+def describe(path: StrPath) -> dict[str, Any]:
+    """Facts about a file, as JSON values.
+
+    Raises:
+        ValueError: Unknown suffix.
+        FormatError: The file is damaged, not in the format of its suffix, or holds no finite splat.
+        OSError: It cannot be read.
+    """
+    path = Path(path)
+    if format_of(path).native:
+        facts = describe_nsvq(path)
+    else:
+        scene = read_scene(path)
+        facts = {
+            "format": suffix_of(path).removeprefix("."),
+            "splats": len(scene),
+            "sh_degree": scene.sh_degree,
+            "bytes": scene.stored_bytes,
+        }
+    plain_bytes = ply.plain_ply_bytes(facts["splats"], facts["sh_degree"])
+    return {"file": str(path), **facts, "plain_bytes": plain_bytes, "ratio": plain_bytes / facts["bytes"]}
 
 
 def suffix_of(path: StrPath) -> str:

@@ -16,13 +16,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write, write_text
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.sog import META, PALETTE_LIMIT, read_sog, sog_contents
-from nsvq_lightning.splats.conventions import Float64s, unit
+from nsvq_lightning.splats.conventions import Float64s, Integers, unit
 
 NAME = "lod-meta.json"
 
@@ -97,7 +96,7 @@ def in_lod_order(scene: CompressedScene) -> CompressedScene:
 # Most splats of the finest level in a leaf, and of any level in a file.
 LEAF, FILE = 1 << 14, 1 << 17
 # Splats of each level.
-_Rows = list[NDArray[np.intp]]
+_Rows = list[Integers]
 _Node = dict[str, Any]
 
 
@@ -140,7 +139,7 @@ def _boxes(scene: CompressedScene) -> Float64s:
     return np.stack([scene.means - reach, scene.means + reach], axis=1)
 
 
-def _files(runs: list[NDArray[np.intp]]) -> Iterator[list[int]]:
+def _files(runs: list[Integers]) -> Iterator[list[int]]:
     """Which leaves, of those that have any splats, share a file."""
     some: list[int] = []
     count = 0

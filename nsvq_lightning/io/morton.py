@@ -5,12 +5,11 @@ from typing import Self
 
 import numpy as np
 from numba import uint64
-from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import INT64, UINT64, check_array, outside
 from nsvq_lightning.io.numbers import power_above, power_below
-from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int32s, Int64s, Uint64s
+from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int32s, Int64s, Integers, Uint64s
 
 # Bits per coordinate: three coordinates make a key of 63 bits.
 AXIS_BITS = 21
@@ -182,7 +181,7 @@ def _row(i, place):  # type: ignore[no-untyped-def]
     return i - (_WINDOW - np.int64(place) % _WINDOW) if place < _NONE else -1
 
 
-def spatial_order(means: Float32s) -> NDArray[np.intp]:
+def spatial_order(means: Float32s) -> Integers:
     """Indices ``[N]`` of splats in Morton order of their positions ``[N, 3]``; equal ones keep their order."""
     cells, _ = Grid.around(means, np.zeros(len(means))).cells(means)
     return morton_keys(cells, np.full(len(means), AXIS_BITS)).argsort(kind="stable")

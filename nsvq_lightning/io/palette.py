@@ -1,5 +1,7 @@
-"""A palette for many rows: cells of similar rows, found by always splitting the cell where that gains most."""
+"""Few rows, or numbers, that represent many: of cells of similar ones, always the one is cut where that gains most."""
 
+import heapq
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -7,8 +9,43 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import kernel
 from nsvq_lightning.compute.memory import check_array, check_table
-from nsvq_lightning.io.scalar_kmeans import split
-from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s
+from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, Int64s, Integers, Uint8s
+
+# From start and end of a cell, how much a cut gains and where it is; the gain is below 0 if there is none.
+_BestCut = Callable[[int, int], tuple[float, int]]
+
+
+def _cells(best_cut: _BestCut, size: int, count: int) -> list[tuple[int, int]]:
+    """Start and end of at most ``count`` cells of ``size`` numbers, cut out of one cell of all."""
+    gain, cut = best_cut(0, size)
+    heap = [(-gain, 0, cut, size)]
+    while len(heap) < count and heap[0][0] <= 0:
+        _, start, cut, end = heapq.heappop(heap)
+        for first, last in ((start, cut), (cut, end)):
+            gain, inner = best_cut(first, last)
+            heapq.heappush(heap, (-gain, first, inner, last))
+    return [(start, end) for _, start, _, end in heap]
+
+
+class _Sums:
+    """Sums over runs of numbers in an order, each run a cell."""
+
+    def __init__(self, numbers: Float64s, mass: Arrays) -> None:
+        self.mass = np.concatenate([[0.0], mass.cumsum()])
+        self.sum = np.concatenate([[0.0], (mass * numbers).cumsum()])
+
+    def best_cut(self, start: int, end: int) -> tuple[float, int]:
+        """How much the sum of squares falls at most if a cell is cut in two, and where; -1 if it does not fall."""
+        if end - start < 2:
+            return -1.0, start
+        cuts = slice(start + 1, end)
+        left = self.mass[cuts] - self.mass[start]
+        right = self.mass[end] - self.mass[cuts]
+        left_mean = (self.sum[cuts] - self.sum[start]) / left
+        right_mean = (self.sum[end] - self.sum[cuts]) / right
+        gains = np.square(left_mean - right_mean) * (left * right / (self.mass[end] - self.mass[start]))
+        best = int(gains.argmax())
+        return float(gains[best]) or -1.0, start + 1 + best  # equal numbers gain nothing
 
 
 def find_palette(rows: Float32s, weight: NDArray[np.number[Any]], count: int) -> tuple[Float32s, Int64s]:
@@ -34,53 +71,23 @@ def find_palette(rows: Float32s, weight: NDArray[np.number[Any]], count: int) ->
     check_table("rows", rows)
     wide = weight.astype(np.float64)
     check_array("weight", wide, rows.shape[:1], wide.dtype)
-    cells, labels = _Cells(rows, wide), np.empty(len(rows), np.int64)
-    for number, (start, end) in enumerate(split(cells.best_cut, len(rows), count)):
-        labels[cells.order[start:end]] = number
+    order = np.arange(len(rows))
+
+    def best_cut(start: int, end: int) -> tuple[float, int]:
+        numbers = order[start:end]
+        along = np.empty(end - start)
+        _place_along(rows, wide, numbers, along)
+        ranks = along.argsort(kind="stable")
+        numbers[:] = numbers[ranks]
+        gain, cut = _Sums(along[ranks], wide[numbers]).best_cut(0, end - start)
+        return gain, start + cut
+
+    labels = np.empty(len(rows), np.int64)
+    for number, (start, end) in enumerate(_cells(best_cut, len(rows), count)):
+        labels[order[start:end]] = number
     mass = np.bincount(labels, wide)
     sums = (np.bincount(labels, wide * column) for column in rows.T)
     return np.stack([total / mass for total in sums], axis=1).astype(np.float32), labels
-
-
-def in_order_of_use(rows: Float32s, labels: NDArray[np.integer]) -> tuple[Float32s, Int64s]:
-    """The distinct rows in use, in order of first use by the splats, and the row of each splat.
-
-    Neighbours then have similar labels. If each splat has its own row, labels count up and cost next to nothing.
-
-    Args:
-        rows: ``[K, D]``.
-        labels: Row of each splat ``[N]``.
-    """
-    used, labels = np.unique(labels, return_inverse=True)
-    distinct, same = np.unique(rows[used], axis=0, return_inverse=True)
-    labels = same.reshape(-1)[labels]  # its shape differs between releases of NumPy
-    _, first = np.unique(labels, return_index=True)
-    order = first.argsort()
-    return distinct[order], order.argsort()[labels]
-
-
-class _Cells:
-    """Runs of ``order [N]``, the indices of the rows; each run is a cell."""
-
-    def __init__(self, rows: Float32s, weight: Float64s) -> None:
-        self._rows, self._weight = rows, weight
-        self.order = np.arange(len(rows))
-
-    def best_cut(self, start: int, end: int) -> tuple[float, int]:
-        """Sort a cell along its direction; returns how much the sum of squares falls if it is cut in two, and where."""
-        if end - start < 2:
-            return -1.0, start
-        numbers = self.order[start:end]
-        along = np.empty(end - start)
-        _place_along(self._rows, self._weight, numbers, along)
-        ranks = along.argsort(kind="stable")
-        numbers[:] = numbers[ranks]
-        mass = self._weight[numbers].cumsum()
-        total = (self._weight[numbers] * along[ranks]).cumsum()
-        left, right = mass[:-1], mass[-1] - mass[:-1]
-        gains = np.square(total[:-1] / left - (total[-1] - total[:-1]) / right) * (left * right / mass[-1])
-        best = int(gains.argmax())
-        return float(gains[best]) or -1.0, start + 1 + best  # equal rows gain nothing
 
 
 @kernel
@@ -122,3 +129,68 @@ def _place_along(rows, weight, numbers, along):  # type: ignore[no-untyped-def]
             return
         for j in range(dim):
             direction[j] = product[j] / length
+
+
+def in_order_of_use(rows: Float32s, labels: Integers) -> tuple[Float32s, Int64s]:
+    """The distinct rows in use, in order of first use by the splats, and the row of each splat.
+
+    Neighbours then have similar labels. If each splat has its own row, labels count up and cost next to nothing.
+
+    Args:
+        rows: ``[K, D]``.
+        labels: Row of each splat ``[N]``.
+    """
+    used, labels = np.unique(labels, return_inverse=True)
+    distinct, same = np.unique(rows[used], axis=0, return_inverse=True)
+    labels = same.reshape(-1)[labels]  # its shape differs between releases of NumPy
+    _, first = np.unique(labels, return_index=True)
+    order = first.argsort()
+    return distinct[order], order.argsort()[labels]
+
+
+def scalar_kmeans(values: Float32s, weight: Integers | int = 1, count: int = 256) -> Float32s:
+    """Levels ``[count]``, ascending, that nearly minimize the mean squared distance of values to their nearest level.
+
+    If there are no more distinct values than levels, the levels are those values. Otherwise one cell of all values is
+    split where that gains most, then always the cell that gains most, until there are enough; the steps of Lloyd (1982)
+    then move each level to the mean of its values until none moves. On random numbers this ends within a tenth of the
+    optimum.
+
+    Args:
+        values: Any shape, at least one, finite.
+        weight: How often each value counts, broadcasts with ``values``.
+        count: Number of levels; the last one is repeated if fewer are enough.
+    """
+    distinct, inverse = np.unique(values, return_inverse=True)
+    weights = np.broadcast_to(weight, values.shape).ravel().astype(np.float64)
+    mass = np.bincount(inverse.ravel(), weights)
+    numbers = distinct[mass > 0].astype(np.float64)
+    mass = mass[mass > 0]
+    if len(numbers) <= count:
+        return np.pad(numbers, (0, count - len(numbers)), "edge").astype(np.float32)
+    middle = float(np.average(numbers, weights=mass))  # sums of differences from it lose no digits
+    sums = _Sums(numbers - middle, mass)
+
+    def means(ends: Integers, empty: Float64s) -> Float64s:
+        """Means ``[C]`` of the cells between ``ends [C + 1]``; for a cell without values, that of ``empty [C]``."""
+        mass = np.diff(sums.mass[ends])
+        return np.where(mass > 0, np.diff(sums.sum[ends]) / np.where(mass > 0, mass, 1) + middle, empty)
+
+    starts = sorted(start for start, _ in _cells(sums.best_cut, len(numbers), count))
+    levels = means(np.array([*starts, len(numbers)]), np.zeros(count))
+    for _ in range(500):  # each costs one search of 256 borders, whatever the number of values
+        borders = np.searchsorted(numbers, _borders(levels))
+        moved = means(np.array([0, *borders, len(numbers)]), levels)
+        if np.array_equal(moved, levels):
+            break
+        levels = moved
+    return levels.astype(np.float32)
+
+
+def nearest_level(values: Float32s, levels: Float32s) -> Uint8s:
+    """Index of the level nearest to each value; ``levels`` ascending, at most 256."""
+    return np.searchsorted(_borders(levels.astype(np.float64)), values).astype(np.uint8)
+
+
+def _borders(levels: Float64s) -> Float64s:
+    return (levels[1:] + levels[:-1]) / 2

@@ -18,6 +18,7 @@ from nsvq_lightning.io.numbers import FLAT, finite_logits, finite_logs, logits_o
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
 from nsvq_lightning.splats.conventions import (
     SH_C0,
+    Arrays,
     Float32s,
     Float64s,
     Uint32s,
@@ -93,7 +94,7 @@ _TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8", "half": "f2", "float16": "f2"},
 }
-# Bits of the numbers in each property of a compressed ``.ply``, the last one in the lowest; opacities are in the colour.
+# Bits of the numbers in each property of a compressed ``.ply``, the last one in the lowest; opacities are in colours.
 _PACKED = {
     "packed_position": (11, 10, 11),
     "packed_rotation": (10, 10, 10),
@@ -277,7 +278,7 @@ def read_ply(path: StrPath) -> CompressedScene:
     return CompressedScene.from_rows(read(path, header, sh_degree), antialiased=header.antialiased)
 
 
-def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, NDArray[Any]]:
+def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, Arrays]:
     """Rows ``[N, D]`` of each attribute."""
     columns = _needed(header, sh_degree)
     # A third scale that is not there stays flat.
@@ -298,19 +299,19 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, N
     return rows
 
 
-def _by_coefficient(rows: NDArray[Any]) -> NDArray[Any]:
+def _by_coefficient(rows: Arrays) -> Arrays:
     """Higher coefficients ``[N, D]``, all of red first, in our order: the three colours of each coefficient."""
     return rows.reshape(len(rows), 3, rows.shape[1] // 3).swapaxes(1, 2).reshape(rows.shape)
 
 
-def _by_color(rows: NDArray[Any]) -> NDArray[Any]:
+def _by_color(rows: Arrays) -> Arrays:
     """Invert :func:`_by_coefficient`."""
     return rows.reshape(len(rows), rows.shape[1] // 3, 3).swapaxes(1, 2).reshape(rows.shape)
 
 
 def read_ply_columns(
     path: StrPath, header: PlyHeader, names: Sequence[str], dtype: type[Any] = np.float32
-) -> Iterator[NDArray[Any]]:
+) -> Iterator[Arrays]:
     """Tables ``[rows, len(names)]`` of some properties of the vertices of a ``.ply`` file, which follow each other.
 
     Raises:
@@ -346,7 +347,7 @@ def _read_ascii(file: BinaryIO, header: PlyHeader) -> Float64s:
     return table
 
 
-def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, NDArray[Any]]:
+def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, Arrays]:
     """Rows ``[N, D]`` of each attribute of a compressed ``.ply``."""
     chunks = _table(path, header.others["chunk"])
     vertices = _table(path, header)
@@ -362,7 +363,7 @@ def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, 
     if "min_r" in header.others["chunk"].properties:
         colors = within(colors, "rgb")
     largest = (vertices["packed_rotation"] >> 30).astype(np.intp)
-    rows: dict[str, NDArray[Any]] = {
+    rows: dict[str, Arrays] = {
         "means": within(shares["packed_position"], "xyz"),
         "quats": from_smallest_three(largest, (shares["packed_rotation"] - 0.5) * math.sqrt(2)),
         "scales": within(shares["packed_scale"], _LENGTHS),
@@ -431,7 +432,7 @@ def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
     """
     scene = scene.in_morton_order()
     starts = np.arange(0, len(scene), _CHUNK)
-    bounds: dict[str, NDArray[Any]] = {}
+    bounds: dict[str, Arrays] = {}
 
     def shares(values: Float32s, names: Sequence[str]) -> Float64s:
         """Shares of the ways from the smallest to the largest values of the chunk, ``[N, 3]``."""

@@ -38,11 +38,12 @@ from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, check_room, json_object, naming_file, wrong_start
 from nsvq_lightning.io.numbers import bytes_of, logits_of_bytes, opacity_of
-from nsvq_lightning.io.scalar_kmeans import nearest_level, scalar_kmeans
 from nsvq_lightning.splats.conventions import (
+    Arrays,
     Float32s,
     Float64s,
     Int64s,
+    Integers,
     Uint8s,
     from_smallest_three,
     sh_coefficients,
@@ -88,8 +89,8 @@ def sog_contents(scene: CompressedScene, palette: int = PALETTE_LIMIT) -> dict[s
         raise ValueError(f"palette must be in 1..{PALETTE_LIMIT}, got {palette}")
     count = len(scene)
     low, high, means = _packed_means(scene.means)
-    scales, scale_levels = _leveled(scene, "scales")
-    colors, color_levels = _leveled(scene, "sh0")
+    scales, scale_levels = _leveled(scene.rows("scales"))
+    colors, color_levels = _leveled(scene.rows("sh0"))
     texels = {
         "means_l.webp": low,
         "means_u.webp": high,
@@ -345,7 +346,7 @@ def _packed_means(
     return halves[..., 0], halves[..., 1], {"mins": low.tolist(), "maxs": high.tolist()}
 
 
-def _low_and_high(numbers: NDArray[Any]) -> Uint8s:
+def _low_and_high(numbers: Arrays) -> Uint8s:
     """The two bytes ``[..., 2]`` of whole numbers below 65536."""
     return numbers.astype("<u2")[..., None].view(np.uint8)
 
@@ -358,34 +359,22 @@ def _packed_quats(rows: Float32s) -> Uint8s:
     return texels
 
 
-def _leveled(scene: CompressedScene, name: str) -> tuple[Uint8s, list[float]]:
-    """Level indices ``[N, D]`` of an attribute, and the levels."""
-    values = scene.rows(name)
-    levels = scalar_kmeans(values, count=_LEVELS)
-    return nearest_level(values, levels), _decimals(levels)
+def _leveled(values: Float32s, weight: Integers | int = 1) -> tuple[Uint8s, list[float]]:
+    """Index of the level of each value, and the levels: the shortest decimals that give the same float32."""
+    from nsvq_lightning.io.palette import nearest_level, scalar_kmeans
+
+    levels = scalar_kmeans(values, weight, _LEVELS)
+    return nearest_level(values, levels), [float(str(level)) for level in levels]
 
 
 def _packed_sh(rows: Float32s, labels: Int64s, sh_degree: int) -> tuple[dict[str, Any], dict[str, Uint8s]]:
     """What ``meta.json`` says of a palette ``[K, D]`` and labels ``[N]``, and their pictures by name."""
-    levels = scalar_kmeans(rows, np.bincount(labels, minlength=len(rows))[:, None], _LEVELS)
-    line = _ROWS_A_LINE * sh_coefficients(sh_degree)
-    meta = {
-        "count": len(rows),
-        "bands": sh_degree,
-        "codebook": _decimals(levels),
-        "files": ["shN_centroids.webp", "shN_labels.webp"],
-    }
-    return meta, {
-        "shN_centroids.webp": _picture(
-            nearest_level(rows, levels).reshape(-1, 3), (math.ceil(len(rows) / _ROWS_A_LINE), line)
-        ),
-        "shN_labels.webp": _picture(_low_and_high(labels), picture_shape(len(labels))),
-    }
-
-
-def _decimals(levels: Float32s) -> list[float]:
-    """Levels as the shortest decimals that give the same float32."""
-    return [float(str(level)) for level in levels]
+    indices, levels = _leveled(rows, np.bincount(labels, minlength=len(rows))[:, None])
+    names = ["shN_centroids.webp", "shN_labels.webp"]
+    meta = {"count": len(rows), "bands": sh_degree, "codebook": levels, "files": names}
+    shape = math.ceil(len(rows) / _ROWS_A_LINE), _ROWS_A_LINE * sh_coefficients(sh_degree)
+    centroids = _picture(indices.reshape(-1, 3), shape)
+    return meta, {names[0]: centroids, names[1]: _picture(_low_and_high(labels), picture_shape(len(labels)))}
 
 
 def _picture(texels: Uint8s, shape: tuple[int, int]) -> Uint8s:

@@ -48,7 +48,7 @@ from nsvq_lightning.io.numbers import Clamped, bytes_of, logits_of_bytes
 from nsvq_lightning.io.placing import UP_AXES, rotated
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import attribute_dims
-from nsvq_lightning.splats.conventions import Float32s, Uint8s, Uint32s
+from nsvq_lightning.splats.conventions import Arrays, Float32s, Uint8s, Uint32s
 
 logger = logging.getLogger(__name__)
 
@@ -111,7 +111,7 @@ _SYSTEMS = (
 _ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 
 
-def _write_frame(path: StrPath, header: SpzHeader, arrays: Mapping[str, NDArray[Any]]) -> int:
+def _write_frame(path: StrPath, header: SpzHeader, arrays: Mapping[str, Arrays]) -> int:
     """Write header and arrays, by the names of :attr:`SpzHeader.sizes`; returns the bytes of the file."""
     contents = [np.ascontiguousarray(arrays[name]).data.cast("B") for name in header.streams]
     axes = _EXTENSION.pack(_AXES, 4, _SYSTEMS.index(header.axes)) if header.axes else b""
@@ -326,7 +326,7 @@ def write_spz(
     stated = axes.upper() if version == 4 or axes != DEFAULT_AXES else ""
     end = 1 << _POSITION - 1
     means = clamped.nearest("means", scene.means * xyz * (1 << fraction), (-end, end - 1))
-    arrays: dict[str, NDArray[Any]] = {
+    arrays: dict[str, Arrays] = {
         "means": means.astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3],
         "opacities": bytes_of(scene.opacities),
         "sh0": _packed(scene, "sh0", _COLOR * 255, 127.5, clamped),

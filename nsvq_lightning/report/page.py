@@ -13,7 +13,7 @@ import torch
 from cv2.typing import MatLike
 
 from nsvq_lightning.io.atomic import write_text
-from nsvq_lightning.report.files import Values
+from nsvq_lightning.report.numbers import Values
 from nsvq_lightning.report.viewer import data_address, fill, script_json
 from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.version import __version__
@@ -38,7 +38,7 @@ def write_page(
         history: The evaluations so far.
         schedule: Phases of the run.
         seconds: Seconds that went into anything but training steps, by what it was.
-        metrics: The content of ``metrics.json``, see :func:`nsvq_lightning.report.files.summarize`; None before it
+        metrics: The content of ``metrics.json``, see :func:`nsvq_lightning.report.numbers.summarize`; None before it
             is known.
         views: One row for each test view, as in ``views.csv``, with ``picture``, the name of its file in ``renders/``.
 

@@ -1,6 +1,7 @@
 """How splats are laid out: arrays, quaternions, coefficients of an SH degree. Without torch: files open fast."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,8 @@ Int64s = NDArray[np.int64]
 Uint8s = NDArray[np.uint8]
 Uint32s = NDArray[np.uint32]
 Uint64s = NDArray[np.uint64]
+Integers = NDArray[np.integer]
+Arrays = NDArray[Any]
 
 # Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh0.
 SH_C0 = 0.5 / math.sqrt(math.pi)

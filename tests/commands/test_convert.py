@@ -14,7 +14,7 @@ from nsvq_lightning.commands.main import main as nsvq
 from nsvq_lightning.data.colmap import find_model, import_pycolmap
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import CompressedScene, read_scene, save
-from nsvq_lightning.io.describe import describe
+from nsvq_lightning.io.formats import describe
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.splats.splats import Splats

@@ -1,9 +1,14 @@
-"""Parts of compressed scenes hold the same splats."""
+"""Parts of compressed scenes hold the same splats, and differences are found."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from compressed_scenes import arrays_of, scene_of
 from compressed_scenes import scene as coded
+from viewer_scenes import plain_scene
+
+from nsvq_lightning.io.compressed import attribute_errors
 
 
 def test_a_crop_keeps_codebooks_and_what_is_inside() -> None:
@@ -18,3 +23,33 @@ def test_a_crop_keeps_codebooks_and_what_is_inside() -> None:
         expected = scene.codebooks[name][scene.codes[name][inside]]
         np.testing.assert_array_equal(small.codebooks[name][small.codes[name]], expected)
         assert len(small.codebooks[name]) == len(np.unique(part.codes[name]))
+
+
+def test_known_changes_are_found() -> None:
+    """Oracle: changes put in by hand."""
+    scene = plain_scene(8, 1)
+    assert set(attribute_errors(scene, scene).values()) == {0.0}
+    half = np.radians(3) / 2
+    turned = np.tile(np.array([np.cos(half), 0, np.sin(half), 0], np.float32), (8, 1))
+    plain = vars(arrays_of(scene)) | {
+        "quats": np.tile(np.array([-2, 0, 0, 0], np.float32), (8, 1)),
+        "opacities": np.zeros(8, np.float32),
+    }
+    read = plain | {
+        "means": plain["means"] + np.float32(0.5),
+        "quats": turned,
+        "scales": plain["scales"] - np.float32(0.25),
+        "opacities": np.full(8, np.log(3), np.float32),  # 3/4 instead of 1/2
+        "sh0": plain["sh0"] + np.float32(0.125),
+    }
+    expected = {"position": 0.5, "rotation": 3, "log-scale": 0.25, "opacity": 0.25, "sh0": 0.125, "shN": 0}
+    assert attribute_errors(scene_of(**read), scene_of(**plain)) == pytest.approx(expected, rel=1e-4)
+
+
+def test_coefficients_that_are_left_out_count_as_zero() -> None:
+    scene = plain_scene(8, 2)
+    arrays = vars(arrays_of(scene))
+    flat = scene_of(**arrays | {"shN": arrays["shN"][:, :0]})
+    expected = np.sqrt(np.mean(arrays["shN"].astype(float) ** 2))
+    assert attribute_errors(flat, scene)["shN"] == pytest.approx(expected)
+    assert attribute_errors(plain_scene(0), plain_scene(0))["position"] == 0

@@ -10,7 +10,7 @@ from compressed_scenes import arrays_of
 from viewer_scenes import coded_scene, nearest_in, plain_scene
 
 from nsvq_lightning.io import FormatError, lod, read_scene, save
-from nsvq_lightning.io.describe import describe
+from nsvq_lightning.io.formats import describe
 
 
 def leaves(node: dict[str, Any]) -> list[dict[str, Any]]:

@@ -14,8 +14,8 @@ import pytest
 import torch
 from chromium import chromium, needs_chromium
 
-from nsvq_lightning.report.files import comparison, curve_figure, write_png
 from nsvq_lightning.report.page import write_page
+from nsvq_lightning.report.pictures import comparison, curve_figure, write_png
 from nsvq_lightning.training.schedule import Phase, Schedule
 
 SCHEDULE = Schedule(total=450)

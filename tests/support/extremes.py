@@ -24,7 +24,7 @@ from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
-from nsvq_lightning.report.files import markdown_table
+from nsvq_lightning.report.numbers import markdown_table
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups

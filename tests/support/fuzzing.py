@@ -204,9 +204,8 @@ def _build_viewer(folder: Path, suffix: str, **options: int) -> list[Path]:
 
 
 def _read_scene(path: Path) -> object:
-    from nsvq_lightning.io.describe import describe
     from nsvq_lightning.io.errors import FormatError
-    from nsvq_lightning.io.formats import read_scene
+    from nsvq_lightning.io.formats import describe, read_scene
 
     with suppress(FormatError):
         describe(path)

@@ -24,7 +24,7 @@ from runs import (
 
 from nsvq_lightning.callbacks import OPTIONAL, STANDARD, DensityControl, MetricReport, RunCheckpoint, standard
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.report import files
+from nsvq_lightning.report import pictures
 from nsvq_lightning.training.module import SplatModule
 
 STEPS = 60
@@ -40,7 +40,7 @@ def one_curve(request: pytest.FixtureRequest) -> Iterator[None]:
     if request.path.parent.name not in ("commands", "runs", "training") or request.path.stem == "test_sweep":
         yield
         return
-    draw = files.write_figure
+    draw = pictures.write_figure
 
     def draw_once(path: Path, figure: Any) -> None:
         if not DRAWN:
@@ -49,7 +49,7 @@ def one_curve(request: pytest.FixtureRequest) -> Iterator[None]:
         path.write_bytes(DRAWN[0])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(files, "write_figure", draw_once)
+        patch.setattr(pictures, "write_figure", draw_once)
         yield
 
 

@@ -16,7 +16,7 @@ from llvmlite import binding
 from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.random import generator
-from nsvq_lightning.report.files import markdown_table
+from nsvq_lightning.report.numbers import markdown_table
 from nsvq_lightning.version import __version__
 
 

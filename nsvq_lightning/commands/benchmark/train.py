@@ -24,7 +24,7 @@ from nsvq_lightning.commands.arguments import find_config
 from nsvq_lightning.commands.benchmark import Scope, timing
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.report.files import evaluate
+from nsvq_lightning.report.numbers import evaluate
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 

@@ -28,13 +28,15 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.nsvq import entropy, rounding
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
-from nsvq_lightning.io.nsvq.precision import MOST_OPACITY_LEVELS, Precision
+from nsvq_lightning.io.nsvq.precision import MAX_OPACITY_LEVELS, Precision
 from nsvq_lightning.io.nsvq.rounding import leaf_paths
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
 from nsvq_lightning.splats.conventions import Int32s, Int64s, Uint64s
 
 # Attributes by when their streams come; the cells of the positions, which are between, follow from the early ones.
-_EARLY, _LATE = ("opacities", "scales"), tuple(name for name in QUANTIZABLE if name != "scales")
+_EARLY = ("opacities", "scales")
+_LATE = tuple(name for name in QUANTIZABLE if name != "scales")
+_ORDER = (*_EARLY, "means", *_LATE)
 _GRID = struct.Struct("<qqqd")
 
 
@@ -55,19 +57,25 @@ def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header
         cells, inside = grid.cells(scene.means)
         keys = morton.morton_keys(cells, depths)
         # The order of the file: along the Morton curve, the far splats at the end.
-        near, far = np.flatnonzero(inside), np.flatnonzero(~inside)
+        near = np.flatnonzero(inside)
         near = near[np.argsort(keys[near], kind="stable")]
-        keys, depths, order = keys[near], depths[near], np.concatenate([near, far])
+        far = np.flatnonzero(~inside)
+        order = np.concatenate([near, far])
+        keys, depths = keys[near], depths[near]
         writing = [pool.submit(_encoded, early[name], order, _before(len(order))) for name in _EARLY]
         positions = pool.submit(entropy.encode_keys, keys, 3 * depths)
         neighbours = _neighbours(keys, depths, len(order))
         writing += [pool.submit(_encoded, tasks[name].result(), order, neighbours) for name in _largest_first()]
-        streams = {name: data for task in writing for name, data in task.result().items()}
-    streams["means"], streams["means.grid"] = positions.result(), _GRID.pack(*grid.base, doublings)
-    streams["means.far"] = scene.means[far].astype("<f4", copy=False).tobytes()
+        streams = {
+            "means": positions.result(),
+            "means.grid": _GRID.pack(*grid.base, doublings),
+            "means.far": scene.means[far].astype("<f4", copy=False).tobytes(),
+        }
+        for task in writing:
+            streams |= task.result()
     entries = {name: task.result().entry for name, task in tasks.items()}
     entries["means"] = AttributeEntry("means", 3, "cells", step=grid.step)
-    attributes = tuple(entries[name] for name in (*_EARLY, "means", *_LATE))
+    attributes = tuple(entries[name] for name in _ORDER)
     table = tuple(StreamEntry(name, len(streams[name]), encoding) for name, encoding in _stream_names(attributes))
     return Header.of(scene, "compact", attributes, table), streams
 
@@ -95,18 +103,18 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
         means = np.concatenate([grid.centers(morton.unmorton(keys), depths), far])
         stored |= {name: late[name].result() for name in _LATE}
     levels = stored.pop("opacities")
-    coded = {name: stored[name] for name in QUANTIZABLE if stored[name].entry.storage == "codes"}
-    on_basis = {name: stored[name] for name in QUANTIZABLE if stored[name].entry.storage == "components"}
-    plain = {name: stored[name].floats() for name in QUANTIZABLE if name not in coded | on_basis}
-    return CompressedScene(
-        means=means,
-        opacities=rounding.logits_of_levels(levels.entry.codes)[levels.values],
-        codes={name: attribute.values for name, attribute in coded.items()},
-        codebooks={name: attribute.floats() for name, attribute in coded.items()},
-        raw=plain | {name: attribute.values.astype(np.float32) for name, attribute in on_basis.items()},
-        bases={name: attribute.floats() for name, attribute in on_basis.items()},
-        **header.of_scene,
-    )
+    codes, codebooks, raw, bases = {}, {}, {}, {}
+    for name, attribute in stored.items():
+        if attribute.entry.storage == "codes":
+            codes[name] = attribute.values
+            codebooks[name] = attribute.floats()
+        elif attribute.entry.storage == "components":
+            raw[name] = attribute.values.astype(np.float32)
+            bases[name] = attribute.floats()
+        else:
+            raw[name] = attribute.floats()
+    opacities = rounding.logits_of_levels(levels.entry.codes)[levels.values]
+    return CompressedScene(means, opacities, codes, codebooks, raw, bases=bases, **header.of_scene)
 
 
 def _largest_first() -> list[str]:
@@ -136,41 +144,7 @@ def _neighbours(keys: Uint64s, depths: Int64s, count: int) -> Int32s:
     return neighbours
 
 
-def _encoded(attribute: rounding.Stored, order: Int64s, neighbours: Int32s) -> dict[str, bytes]:
-    """The streams of an attribute, but not of the positions, for splats in an order."""
-    entry, values, codebook = attribute.entry, attribute.values[order], attribute.codebook
-    if entry.storage == "steps":
-        return {entry.name: entropy.encode_integers(values)}
-    if entry.storage == "components":
-        assert codebook is not None
-        return {f"{entry.name}.basis": entropy.encode_integers(codebook), entry.name: entropy.encode_integers(values)}
-    paths = {entry.name: entropy.encode_paths(leaf_paths(entry.codes)[values], entry.bits, neighbours)}
-    return paths if codebook is None else paths | {f"{entry.name}.codebook": entropy.encode_integers(codebook)}
-
-
-def _decoded(entry: AttributeEntry, streams: Mapping[str, memoryview], near: Int32s) -> rounding.Stored:
-    """Invert :func:`_encoded`."""
-    if entry.storage == "steps":
-        return rounding.Stored(entry, entropy.decode_integers(streams[entry.name], len(near), entry.dim))
-    if entry.storage == "components":
-        basis = entropy.decode_integers(streams[f"{entry.name}.basis"], entry.codes, entry.dim)
-        coefficients = entropy.decode_integers(streams[entry.name], len(near), entry.codes)
-        for integers in (basis, coefficients):
-            if max(-int(integers.min(initial=0)), int(integers.max(initial=0))) >= rounding.SMALL:
-                raise FormatError(f"damaged: a component of {entry.name} is not below 2^23 in size")
-        return rounding.Stored(entry, coefficients, basis)
-    leaf_of = np.full(1 << entry.bits, -1)
-    leaf_of[leaf_paths(entry.codes)] = np.arange(entry.codes)
-    values = leaf_of[entropy.decode_paths(streams[entry.name], entry.bits, near)]
-    if (values < 0).any():
-        raise FormatError(f"damaged: a code of {entry.name} is not one of {entry.codes}")
-    if entry.storage == "levels":
-        return rounding.Stored(entry, values)
-    codebook = entropy.decode_integers(streams[f"{entry.name}.codebook"], entry.codes, entry.dim)
-    return rounding.Stored(entry, values, codebook)
-
-
-# Endings of the names and encodings of the streams that an attribute has, by its storage.
+# Encodings of the streams that an attribute has, by its storage and the ends of their names.
 _STREAMS = {
     "levels": {"": "paths"},
     "steps": {"": "integers"},
@@ -185,6 +159,44 @@ def _stream_names(attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, str
     return [(entry.name + end, kind) for entry in attributes for end, kind in _STREAMS[entry.storage].items()]
 
 
+# The end of the name of the stream with the table that an attribute's values refer to.
+_TABLES = {"codes": ".codebook", "components": ".basis"}
+
+
+def _encoded(attribute: rounding.Stored, order: Int64s, neighbours: Int32s) -> dict[str, bytes]:
+    """The streams of an attribute, but not of the positions, for splats in an order."""
+    entry = attribute.entry
+    values = attribute.values[order]
+    if _STREAMS[entry.storage][""] == "paths":
+        streams = {entry.name: entropy.encode_paths(leaf_paths(entry.codes)[values], entry.bits, neighbours)}
+    else:
+        streams = {entry.name: entropy.encode_integers(values)}
+    if attribute.codebook is not None:
+        streams[entry.name + _TABLES[entry.storage]] = entropy.encode_integers(attribute.codebook)
+    return streams
+
+
+def _decoded(entry: AttributeEntry, streams: Mapping[str, memoryview], near: Int32s) -> rounding.Stored:
+    """Invert :func:`_encoded`."""
+    own = streams[entry.name]
+    codebook = None
+    if entry.storage in _TABLES:
+        codebook = entropy.decode_integers(streams[entry.name + _TABLES[entry.storage]], entry.codes, entry.dim)
+    if _STREAMS[entry.storage][""] == "paths":
+        leaf_of = np.full(1 << entry.bits, -1)
+        leaf_of[leaf_paths(entry.codes)] = np.arange(entry.codes)
+        values = leaf_of[entropy.decode_paths(own, entry.bits, near)]
+        if (values < 0).any():
+            raise FormatError(f"damaged: a code of {entry.name} is not one of {entry.codes}")
+    else:
+        values = entropy.decode_integers(own, len(near), entry.codes or entry.dim)
+    if codebook is not None and entry.storage == "components":
+        for integers in (codebook, values):
+            if np.abs(integers).max(initial=0) >= rounding.SMALL:
+                raise FormatError(f"damaged: a component of {entry.name} is not below 2^23 in size")
+    return rounding.Stored(entry, values, codebook)
+
+
 # Three float32.
 _FAR_BYTES = 12
 
@@ -192,7 +204,7 @@ _FAR_BYTES = 12
 def _check_tables(header: Header) -> None:
     """Compare with the tables this release would write, before anything is allocated from their sizes."""
     dims = attribute_dims(header.sh_degree)
-    header.check_attributes({name: dims[name] for name in (*_EARLY, "means", *_LATE)}, _possible)
+    header.check_attributes({name: dims[name] for name in _ORDER}, _possible)
     if [(stream.name, stream.encoding) for stream in header.streams] != _stream_names(header.attributes):
         raise FormatError("damaged: the stream table does not fit the attribute table")
     lengths = {stream.name: stream.length for stream in header.streams}
@@ -206,11 +218,25 @@ def _check_tables(header: Header) -> None:
             errors.check_room(f"rows of {name}", entry.codes, lengths[name], errors.FEW_ROWS, each=1)
 
 
+# Attributes that may be stored so.
+_STORED = {
+    "cells": ("means",),
+    "levels": ("opacities",),
+    "steps": QUANTIZABLE,
+    "codes": QUANTIZABLE,
+    "components": ("shN",),
+}
+
+
 def _possible(entry: AttributeEntry) -> bool:
-    own = {"means": "cells", "opacities": "levels"}.get(entry.name, "steps")
-    coded = entry.dim > 0 and entry.name in {"codes": QUANTIZABLE, "components": ("shN",)}.get(entry.storage, ())
-    most = {"codes": 1 << 32, "levels": MOST_OPACITY_LEVELS, "components": entry.dim}.get(entry.storage, 0)
-    numbers = min(most, 1) <= entry.codes <= most and (entry.step > 0) == (entry.storage != "levels")
-    # Float32 has all multiples of such a step below 2^23.
-    numbers &= entry.storage != "components" or (math.frexp(entry.step)[0] == 0.5 and 2.0**-149 <= entry.step <= 1)
-    return (coded or entry.storage == own) and numbers
+    if entry.name not in _STORED.get(entry.storage, ()):
+        return False
+    if entry.storage == "levels":
+        return entry.step == 0 and 1 <= entry.codes <= MAX_OPACITY_LEVELS
+    if entry.storage == "codes":
+        return entry.step > 0 and entry.dim > 0 and 1 <= entry.codes <= 1 << 32
+    if entry.storage == "components":
+        # Float32 has all multiples of such a step below 2^23.
+        power_of_two = math.frexp(entry.step)[0] == 0.5
+        return power_of_two and 2.0**-149 <= entry.step <= 1 and 1 <= entry.codes <= entry.dim
+    return entry.step > 0 and entry.codes == 0

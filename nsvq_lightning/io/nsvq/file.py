@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
@@ -13,7 +12,7 @@ from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry, frame, read_frame
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, listed
-from nsvq_lightning.splats.conventions import Float32s, Uint32s
+from nsvq_lightning.splats.conventions import Float32s, Integers, Uint32s
 
 
 def encode(scene: CompressedScene, storage: Storage) -> tuple[Header, dict[str, bytes]]:
@@ -102,7 +101,7 @@ def decode(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene
 _CHUNK = 1 << 14
 
 
-def pack_fields(fields: Sequence[NDArray[np.integer]], widths: Sequence[int]) -> bytes:
+def pack_fields(fields: Sequence[Integers], widths: Sequence[int]) -> bytes:
     """Pack one record per row: field after field, lowest bit first, rows without any padding between them.
 
     Bit ``b`` of the stream is bit ``b % 8`` of byte ``b // 8``; row ``i`` starts at bit ``i · Σ widths``; the bits

@@ -8,10 +8,10 @@ from typing import Any
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 
 # Largest number of opacity levels that readers accept.
-MOST_OPACITY_LEVELS = 1 << 20
+MAX_OPACITY_LEVELS = 1 << 20
 
 # Smallest and largest error that the opacity may have.
-OPACITY_ERRORS = 0.5 / MOST_OPACITY_LEVELS, 0.25
+OPACITY_ERRORS = 0.5 / MAX_OPACITY_LEVELS, 0.25
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class Precision:
             value = getattr(self, entry.name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"precision: {entry.name} must be a positive number, got {value}")
-        least, most = OPACITY_ERRORS
-        if not least <= self.opacity <= most:
-            raise ValueError(f"precision: opacity must be from {least:.3g} to {most:g}, got {self.opacity}")
+        low, high = OPACITY_ERRORS
+        if not low <= self.opacity <= high:
+            raise ValueError(f"precision: opacity must be from {low:.3g} to {high:g}, got {self.opacity}")
 
     def of(self, name: str) -> float:
         """Largest error of an attribute without a codebook; one that has no option has the error that it declares."""

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import kernel
 from nsvq_lightning.compute.memory import check_table
@@ -18,7 +17,7 @@ from nsvq_lightning.io.morton import Grid
 from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.io.numbers import coarsest_power, nearest_power, opacity_of
-from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s, unit
+from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s, Integers, unit
 
 # Coefficients and integers of a basis are below it in size: float32 has them, and 45 products add up to less than 2^52.
 SMALL = 1 << 23
@@ -71,7 +70,7 @@ def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
     return _coded(name, scene.codes[name], scene.codebooks[name], precision.codebook)
 
 
-def _coded(name: str, codes: NDArray[np.integer], codebook: Float32s, error: float) -> Stored:
+def _coded(name: str, codes: Integers, codebook: Float32s, error: float) -> Stored:
     used = np.bincount(codes, minlength=len(codebook)) > 0
     rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
     distinct = np.unique(unit(rows).astype(np.float32) if name == "quats" else rows, axis=0)

@@ -14,8 +14,8 @@ from PIL import Image
 from viewer_scenes import needs_zstd
 
 from nsvq_lightning.io import FormatError, read_scene
-from nsvq_lightning.io.describe import describe
 from nsvq_lightning.io.errors import FEW_SPLATS, check_room
+from nsvq_lightning.io.formats import describe
 from nsvq_lightning.io.spz import zstd_compress
 
 

@@ -31,7 +31,7 @@ from viewer_scenes import (
 
 from nsvq_lightning.compression.viewpoints import Measure, decibels
 from nsvq_lightning.io import CompressedScene, FormatError, load, read_scene, save
-from nsvq_lightning.io.describe import describe
+from nsvq_lightning.io.formats import describe
 from nsvq_lightning.io.sog import write_sog
 from nsvq_lightning.rendering.sh import sh_basis
 

@@ -30,7 +30,7 @@ from viewer_scenes import (
 )
 
 from nsvq_lightning.io import read_scene, save
-from nsvq_lightning.io.describe import describe
+from nsvq_lightning.io.formats import describe
 
 TOOL = os.environ.get("NSVQ_SPLAT_TRANSFORM") or shutil.which("splat-transform")
 COUNT = 120

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from nsvq_lightning.report import files
-from nsvq_lightning.report.files import file_stem, video_writer
+from nsvq_lightning.report import pictures
+from nsvq_lightning.report.pictures import file_stem, video_writer
 
 
 def _pictures() -> list[np.ndarray[Any, Any]]:
@@ -34,7 +34,7 @@ def _frames(path: Path) -> list[np.ndarray[Any, Any]]:
 @pytest.fixture(params=["H.264", "VP9"])
 def codec(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     if request.param == "VP9":
-        monkeypatch.setattr(files.shutil, "which", lambda name: None)
+        monkeypatch.setattr(pictures.shutil, "which", lambda name: None)
     elif shutil.which("ffmpeg") is None:
         pytest.skip("ffmpeg is not installed")
     return str(request.param)
@@ -78,7 +78,7 @@ def test_what_ffmpeg_says_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     program = tmp_path / "ffmpeg"
     program.write_text("#!/bin/sh\necho no such codec >&2\ncat > /dev/null\nexit 1\n")
     program.chmod(0o755)
-    monkeypatch.setattr(files.shutil, "which", lambda name: str(program))
+    monkeypatch.setattr(pictures.shutil, "which", lambda name: str(program))
     with (
         pytest.raises(OSError, match="could not write the video: no such codec"),
         video_writer(tmp_path / "a.mp4", 64, 48, 12) as add,

@@ -1,0 +1,143 @@
+"""The numbers of a run: scores of views, ``metrics.json``, and tables."""
+
+import csv
+import io
+import json
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.distributed
+from torch import Tensor
+
+from nsvq_lightning.data.scene import View
+from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.nsvq.file import paper_header
+from nsvq_lightning.io.nsvq.header import read_header
+from nsvq_lightning.io.ply import plain_ply_bytes
+from nsvq_lightning.quality.loss import apply_mask, ssim
+from nsvq_lightning.quality.metrics import eight_bit, psnr
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.splats.conventions import Integers
+from nsvq_lightning.training.module import SplatModule
+from nsvq_lightning.training.schedule import Phase
+
+Values = Mapping[str, Any]
+
+
+@torch.no_grad()
+def evaluate(
+    render_image: Callable[[Camera], Tensor],
+    views: Iterable[View],
+    device: torch.device,
+    show: Callable[[Tensor, Tensor], None] | None = None,
+) -> tuple[float, float]:
+    """Mean PSNR, dB, and SSIM of rendered views against their photos, over the views of all processes.
+
+    Args:
+        render_image: Image ``[H, W, 3]`` of a camera.
+        views: What to compare with.
+        device: Where the splats are.
+        show: Called with the first image and its photo.
+
+    Raises:
+        ValueError: There are no views.
+    """
+    sums = torch.zeros(3, dtype=torch.float64, device=device)  # of PSNR, of SSIM, and of views
+    for view in views:
+        view = view.to(device)
+        image = apply_mask(render_image(view.camera), view.mask)
+        if show is not None:
+            show(image, view.image)
+            show = None
+        pair = eight_bit(image), eight_bit(view.image)
+        sums += torch.stack([psnr(*pair, view.mask), ssim(*pair, view.mask).double(), sums.new_ones(())])
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        torch.distributed.all_reduce(sums)
+    if sums[2] == 0:
+        raise ValueError("there are no views to evaluate; the scene needs at least one test view")
+    mean_psnr, mean_ssim = (sums[:2] / sums[2]).float().tolist()
+    return mean_psnr, mean_ssim
+
+
+def summarize(
+    path: Path,
+    scene: CompressedScene,
+    scores: Sequence[Values],
+    lpips: tuple[float | None, str | None],
+    module: SplatModule,
+    paper: Values,
+) -> dict[str, Any]:
+    """The content of ``metrics.json``; sizes in bytes, PSNR in dB, times in seconds.
+
+    Args:
+        path: The file that was decoded.
+        scene: The decoded scene.
+        scores: Row of each test view in ``views.csv``: its name, ``psnr``, ``ssim``, ``cc_psnr`` and ``cc_ssim``.
+        lpips: Mean LPIPS and None, or None and the reason.
+        module: The module, for its history and schedule.
+        paper: :func:`paper_level` of the scene that was stored.
+    """
+    scored = "psnr", "ssim", "cc_psnr", "cc_ssim"
+    file_bytes, header = path.stat().st_size, read_header(path)
+    plain_bytes = plain_ply_bytes(len(scene), scene.sh_degree)
+    last = {str(entry["phase"]): dict(entry) for entry in module.history}  # the last evaluation of each phase
+    ends = [last[phase.name.lower()] for phase in Phase if phase.name.lower() in last]
+    return {
+        **{name: float(sum(score[name] for score in scores)) / len(scores) for name in scored},
+        "lpips": lpips[0],
+        "lpips_reason": lpips[1],
+        "views": len(scores),
+        "num_splats": len(scene),
+        "file_bytes": file_bytes,
+        "plain_bytes": plain_bytes,
+        "ratio": plain_bytes / file_bytes,
+        "level": header.level,
+        "streams": {"header": header.size, **{stream.name: stream.length for stream in header.streams}},
+        "codes": {name: _codes_in_use(codes, len(scene.codebooks[name])) for name, codes in scene.codes.items()},
+        "paper_level": dict(paper),
+        "train_seconds": module.stopwatch.seconds,
+        "before_quantization": last.get(Phase(Phase.QUANTIZE - 1).name.lower()) if scene.codebooks else None,
+        "phases": ends,
+    }
+
+
+def paper_level(scene: CompressedScene) -> dict[str, Any]:
+    """Bytes of the scene at level ``paper``: the paper's formula, with its header."""
+    header = paper_header(scene)
+    return {"file_bytes": header.file_bytes, "header_bytes": header.size}
+
+
+def write_metrics(path: Path, metrics: Values) -> None:
+    """Write the numbers as JSON, atomically; an infinite PSNR (no error at all) becomes null."""
+    finite = json.loads(json.dumps(metrics), parse_constant=lambda name: None)
+    write_text(path, json.dumps(finite, indent=2) + "\n")
+
+
+def _codes_in_use(codes: Integers, size: int) -> dict[str, Any]:
+    """Rows of the codebook, how many of them are used, and the entropy of the codes, bits each."""
+    counts = np.bincount(codes, minlength=size)
+    shares = counts[counts > 0] / max(1, len(codes))
+    return {"codebook": size, "used": len(shares), "entropy": float(-(shares * np.log2(shares)).sum()) + 0.0}
+
+
+def write_csv(path: Path, rows: Sequence[Values]) -> None:
+    """Write rows with the same keys as CSV, atomically; the keys of the first row, in order, are the header."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: Collection[str]) -> str:
+    """A Markdown table that also reads well as plain text; columns named in ``words`` align left, numbers right."""
+    columns = []
+    for name, *cells in zip(head, *rows, strict=True):
+        width = max(3, *map(len, (name, *cells)))
+        rule, pad = ("-" * width, str.ljust) if name in words else ("-" * (width - 1) + ":", str.rjust)
+        columns.append([pad(cell, width) for cell in (name, rule, *cells)])
+    return "\n".join(f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))

@@ -1,0 +1,196 @@
+"""What a run shows: pictures of its views, its curve, and videos, under names that every file system has."""
+
+import logging
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from hashlib import sha256
+from itertools import count, cycle
+from pathlib import Path
+from typing import Any
+from unicodedata import normalize
+
+import cv2
+import numpy as np
+import torch
+from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
+from torch import Tensor
+
+from nsvq_lightning.io.atomic import atomic_path, atomic_write, write_bytes
+from nsvq_lightning.splats.conventions import Uint8s
+from nsvq_lightning.training.schedule import Phase, Schedule
+
+log = logging.getLogger(__name__)
+
+# Bytes of a file name without suffix; file systems take 143 to 255 with it.
+LONGEST = 120
+# Suffix of videos.
+VIDEO = ".mp4"
+
+
+def file_stem(name: str, names: tuple[str, ...] = ()) -> str:
+    """File name without suffix for a view: folders of its name become underscores.
+
+    A name that is too long, or would be that of another view too where case makes no difference, ends in a digest.
+
+    Args:
+        name: Of the view.
+        names: Of all views whose files go into one folder.
+    """
+    return _file_stems(names if name in names else (name,))[name]
+
+
+@lru_cache(maxsize=8)
+def _file_stems(names: tuple[str, ...]) -> dict[str, str]:
+    """A file name without suffix for each name; those that are too long or used twice end in a digest."""
+    plain = {name: re.sub(r"[/\\]", "_", str(Path(name).with_suffix(""))) for name in names}
+    # What file systems that do not tell case or composed characters apart make of them.
+    folded = {name: normalize("NFKC", normalize("NFKC", stem).casefold()) for name, stem in plain.items()}
+    uses = Counter(folded.values())
+    stems = {}
+    for name, stem in plain.items():
+        if uses[folded[name]] > 1 or len(os.fsencode(stem)) > LONGEST or "~" in folded[name]:
+            stem = f"{stem[: LONGEST // 5]}~{sha256(os.fsencode(name)).hexdigest()[:12]}"
+        stems[name] = stem
+    return stems
+
+
+def comparison(image: Tensor, photo: Tensor) -> Tensor:
+    """Photo, render and four times the absolute error, so that small ones show, side by side ``[H, 3·W, 3]``.
+
+    Args:
+        image: Rendered view ``[H, W, 3]`` in [0, 1].
+        photo: Photo ``[H, W, 3]`` in [0, 1].
+    """
+    return torch.cat([photo, image, ((image - photo).abs() * 4).clamp(max=1.0)], dim=1)
+
+
+def as_bytes(image: Tensor) -> Uint8s:
+    """An image ``[H, W, 3]`` in [0, 1] with 8 bits."""
+    return np.asarray((image.clamp(0.0, 1.0) * 255).round().to(torch.uint8).cpu().numpy())
+
+
+def write_png(path: Path, image: Tensor) -> None:
+    """Write an RGB image ``[H, W, 3]`` in [0, 1] as 8-bit PNG, atomically."""
+    write_bytes(path, cv2.imencode(".png", cv2.cvtColor(as_bytes(image), cv2.COLOR_RGB2BGR))[1].tobytes())
+
+
+def log_pictures(loggers: Sequence[Logger], pictures: Sequence[Path], step: int) -> None:
+    """Show PNG files in TensorBoard and Weights & Biases, as ``test/<file name>``; other loggers get none.
+
+    Args:
+        loggers: Loggers of a trainer.
+        pictures: The files, 8-bit RGB.
+        step: Iteration they belong to.
+    """
+    for logger in loggers:
+        if isinstance(logger, WandbLogger):
+            names = [path.stem for path in pictures]
+            logger.log_image("test/views", [str(path) for path in pictures], step, caption=names)
+        elif isinstance(logger, TensorBoardLogger):
+            for path in pictures:
+                image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+                logger.experiment.add_image(f"test/{path.stem}", image, step, dataformats="HWC")
+
+
+@contextmanager
+def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Callable[[Uint8s], Any]]:
+    """Write a video atomically: it is there when the block ends without an error.
+
+    The block gets a function that adds a picture ``[H, W, 3]``, RGB.
+
+    It is H.264 where the program ``ffmpeg`` is installed, which every player opens; otherwise VP9, which browsers and
+    most players open.
+
+    Args:
+        path: File, ``.mp4``.
+        width: Pixels, even.
+        height: Pixels, even.
+        fps: Frames per second.
+
+    Raises:
+        ValueError: An odd size.
+        OSError: The video cannot be written.
+    """
+    if width % 2 or height % 2:
+        raise ValueError(f"{path}: width and height of a video must be even, got {width}x{height}")
+    program = shutil.which("ffmpeg")
+    log.info("%s: %s", path, "H.264" if program else "VP9")
+    # Both programs tell the container by the suffix, which the unfinished file does not have.
+    with atomic_path(path) as unfinished, tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        lossless, file = Path(folder) / "video.avi", Path(folder) / f"video{VIDEO}"
+        written, code = (lossless, "FFV1") if program else (file, "vp09")
+        video = cv2.VideoWriter(str(written), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*code), fps, (width, height))
+        if not video.isOpened():
+            raise OSError(f"OpenCV cannot write {code} here: write PNGs into a folder")
+        try:
+            yield lambda rgb: video.write(np.ascontiguousarray(rgb[:, :, ::-1]))
+        finally:
+            video.release()
+        if program:
+            options = ["-c:v", "libx264", "-crf", "17", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+            command = [program, "-loglevel", "error", "-i", str(lossless), *options, str(file)]
+            ended = subprocess.run(command, capture_output=True, check=False, stdin=subprocess.DEVNULL)
+            if ended.returncode:
+                raise OSError(f"ffmpeg could not write the video: {ended.stderr.decode(errors='replace').strip()}")
+        file.replace(unfinished)
+
+
+@contextmanager
+def frame_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Callable[[Tensor], object]]:
+    """Write frames ``[H, W, 3]`` in [0, 1] into a video (:func:`video_writer`), or as PNGs into a folder.
+
+    Args:
+        path: A folder if it has no suffix.
+        width: Pixels.
+        height: Pixels.
+        fps: Frames per second.
+    """
+    if path.suffix:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with video_writer(path, width, height, fps) as add:
+            yield lambda picture: add(as_bytes(picture))
+    else:
+        path.mkdir(parents=True, exist_ok=True)
+        names = (path / f"{index:05d}.png" for index in count())
+        yield lambda picture: write_png(next(names), picture)
+
+
+def new_figure(width: float, height: float) -> Any:
+    """An empty figure, size in inches; pyplot is not used, as it keeps global state and may look for a display."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def write_figure(path: Path, figure: Any) -> None:
+    """Write a figure as PNG, cropped to its content, atomically."""
+    with atomic_write(path) as file:
+        figure.savefig(file, format="png", bbox_inches="tight")
+
+
+def curve_figure(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> Any:
+    """PSNR and number of splats over the iterations, with phases shaded, as a Matplotlib figure."""
+    figure = new_figure(8, 4)
+    quality = figure.add_subplot()
+    number = quality.twinx()
+    iterations = [entry["iteration"] for entry in history]
+    start, colours = 0, ("#dfe8f5", "#f8e6d0", "#dcefdc", "#efe0f0")
+    for phase, end, colour in zip(Phase, schedule.ends, cycle(colours), strict=False):
+        if end > start:
+            quality.axvspan(start, end, color=colour, label=phase.name.lower(), linewidth=0)
+        start = end
+    quality.plot(iterations, [entry["psnr"] for entry in history], "o-", color="#1f4e9c", markersize=3)
+    number.plot(iterations, [entry["splats"] for entry in history], "-", color="#b5651d")
+    quality.set(xlabel="iteration", xlim=(0, max(schedule.ends[-1], 1)))
+    quality.set_ylabel("test PSNR, dB", color="#1f4e9c")
+    number.set_ylabel("splats", color="#b5651d")
+    number.set_ylim(bottom=0)
+    quality.legend(loc="lower right", fontsize="small")
+    return figure
