@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from nsvq_lightning.io.atomic import StrPath, atomic_write, write_text
+from nsvq_lightning.io.atomic import StrPath, write_bytes, write_text
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.sog import META, PALETTE_LIMIT, read_sog, sog_contents
@@ -61,25 +61,31 @@ def write_lod(
     target.parent.mkdir(parents=True, exist_ok=True)
     names: list[str] = []
     total = 0
-    for level, splats in enumerate(levels):
-        for number, runs in enumerate(_files([rows[level] for rows, _ in leaves])):
-            contents = sog_contents(splats.take(np.concatenate([leaves[leaf][0][level] for leaf in runs])), palette)
+    for number, splats in enumerate(levels):
+        for part, runs in enumerate(_files([(rows[number], node) for rows, node in leaves])):
+            contents = sog_contents(splats.take(np.concatenate([rows for rows, _ in runs])), palette)
             # Those of two indices in one folder differ.
-            folder = (
-                f"{target.name[: -len(NAME)]}{level}_{number}_{sha256(b''.join(contents.values())).hexdigest()[:8]}"
-            )
+            digest = sha256(b"".join(contents.values())).hexdigest()[:8]
+            folder = f"{target.name.removesuffix(NAME)}{number}_{part}_{digest}"
             (target.parent / folder).mkdir(exist_ok=True)
             for name, data in contents.items():
-                with atomic_write(target.parent / folder / name) as file:
-                    total += file.write(data)
+                write_bytes(target.parent / folder / name, data)
+                total += len(data)
             offset = 0
-            for leaf in runs:
-                rows, node = leaves[leaf]
-                node["lods"][str(level)] = {"file": len(names), "offset": offset, "count": len(rows[level])}
-                offset += len(rows[level])
+            for rows, node in runs:
+                node["lods"][str(number)] = {"file": len(names), "offset": offset, "count": len(rows)}
+                offset += len(rows)
             names.append(f"{folder}/{META}")
-    about = {"version": 1, "asset": {"generator": "nsvq-lightning"}, "count": sum(counts), "counts": counts}
-    index = json.dumps(about | {"lodLevels": len(levels), "filenames": names, "tree": tree}, separators=(",", ":"))
+    about = {
+        "version": 1,
+        "asset": {"generator": "nsvq-lightning"},
+        "count": sum(counts),
+        "counts": counts,
+        "lodLevels": len(levels),
+        "filenames": names,
+        "tree": tree,
+    }
+    index = json.dumps(about, separators=(",", ":"))
     write_text(target, index)
     ours = {name.partition("/")[0] for name in names}
     for folder in {name.partition("/")[0] for name in old if name.count("/") == 1} - ours:
@@ -95,34 +101,38 @@ def in_lod_order(scene: CompressedScene) -> CompressedScene:
 
 # Most splats of the finest level in a leaf, and of any level in a file.
 LEAF, FILE = 1 << 14, 1 << 17
-# Splats of each level.
-_Rows = list[Integers]
 _Node = dict[str, Any]
 
 
-def _tree(levels: Sequence[CompressedScene]) -> tuple[_Node, list[tuple[_Rows, _Node]]]:
+def _tree(levels: Sequence[CompressedScene]) -> tuple[_Node, list[tuple[list[Integers], _Node]]]:
     """The root, and in their order the leaves with the splats of each level in them."""
     from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
 
-    boxes = [_boxes(level) for level in levels]
-    leaves: list[tuple[_Rows, _Node]] = []
+    # Splats of all levels, one level after another, and the first of each.
+    means = np.concatenate([level.means for level in levels])
+    boxes = np.concatenate([_boxes(level) for level in levels])
+    starts = np.cumsum([0, *map(len, levels)])
+    leaves: list[tuple[list[Integers], _Node]] = []
 
-    def node(rows: _Rows) -> _Node:
-        inside = np.concatenate([ends[some] for ends, some in zip(boxes, rows, strict=True)])
-        box = {"min": inside[:, 0].min(0), "max": inside[:, 1].max(0)}
-        bound = {name: [float(f"{x:.7g}") for x in end] for name, end in box.items()}
-        positions = [level.means[some] for level, some in zip(levels, rows, strict=True)]
-        axis = int(positions[0].std(0).argmax())
-        middle = np.median(positions[0][:, axis])
-        below = [points[:, axis] < middle for points in positions]
-        if len(rows[0]) > LEAF and below[0].any():
-            halves = [[some[side ^ upper] for some, side in zip(rows, below, strict=True)] for upper in (False, True)]
-            return {"bound": bound, "children": [node(half) for half in halves]}
-        leaf: _Node = {"bound": bound, "lods": {}}
-        leaves.append(([some[spatial_order(p)] for some, p in zip(rows, positions, strict=True)], leaf))
-        return leaf
+    def node(splats: Integers) -> _Node:
+        low, high = boxes[splats, 0].min(0), boxes[splats, 1].max(0)
+        found: _Node = {"bound": {"min": _decimals(low), "max": _decimals(high)}}
+        finest, *coarser = np.split(splats, np.searchsorted(splats, starts[1:-1]))
+        axis = int(means[finest].std(0).argmax())
+        middle = np.median(means[finest, axis])
+        below = means[splats, axis] < middle
+        if len(finest) > LEAF and below[: len(finest)].any():
+            return found | {"children": [node(splats[below]), node(splats[~below])]}
+        found["lods"] = {}
+        rows = [each[spatial_order(means[each])] for each in (finest, *coarser)]
+        leaves.append(([each - start for each, start in zip(rows, starts, strict=False)], found))
+        return found
 
-    return node([np.arange(len(level)) for level in levels]), leaves
+    return node(np.arange(len(means))), leaves
+
+
+def _decimals(position: Float64s) -> list[float]:
+    return [float(f"{x:.7g}") for x in position]
 
 
 # The box of a splat ends where its density is that of so many standard deviations.
@@ -139,28 +149,28 @@ def _boxes(scene: CompressedScene) -> Float64s:
     return np.stack([scene.means - reach, scene.means + reach], axis=1)
 
 
-def _files(runs: list[Integers]) -> Iterator[list[int]]:
-    """Which leaves, of those that have any splats, share a file."""
-    some: list[int] = []
+def _files(runs: list[tuple[Integers, _Node]]) -> Iterator[list[tuple[Integers, _Node]]]:
+    """The leaves with any splats, by the file that they share."""
+    some: list[tuple[Integers, _Node]] = []
     count = 0
-    for leaf, rows in enumerate(runs):
+    for rows, node in runs:
         if some and count + len(rows) > FILE:
             yield some
             some, count = [], 0
         if len(rows):
-            some.append(leaf)
+            some.append((rows, node))
             count += len(rows)
     yield some
 
 
 # Of an index; one of 100 million splats has a fifth of it.
-_MOST_BYTES = 1 << 26
+_MAX_BYTES = 1 << 26
 
 
 def _index(path: Path) -> dict[str, list[str]]:
     """Of ``lod-meta.json``: ``filenames``, and those ``shown``, of the finest level and what surrounds the scene."""
     with naming_file(path):
-        if path.stat().st_size > _MOST_BYTES:
+        if path.stat().st_size > _MAX_BYTES:
             raise FormatError(f"damaged: an index cannot have {path.stat().st_size} bytes")
         try:
             index = json.loads(path.read_bytes())

@@ -124,8 +124,7 @@ def nearest_power(value: float) -> float:
 def coarsest_power(values: Float32s) -> float:
     """The largest power of two of which all ``values`` are integer multiples, 0 if all are 0; they must be finite."""
     mantissas, exponents = np.frexp(values[values != 0])
-    if not mantissas.size:
-        return 0.0
     wholes = np.ldexp(mantissas, 24).astype(np.int64)  # float32 has so many bits
     lowest = (wholes & -wholes).astype(np.float64)  # the lowest bit that is set
-    return math.ldexp(1.0, int((np.frexp(lowest)[1] - 1 + exponents).min()) - 24)
+    powers = np.ldexp(lowest, exponents - 24)
+    return float(powers.min()) if powers.size else 0.0

@@ -9,43 +9,41 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import kernel
 from nsvq_lightning.compute.memory import check_array, check_table
-from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, Int64s, Integers, Uint8s
+from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s, Integers, Uint8s
 
-# From start and end of a cell, how much a cut gains and where it is; the gain is below 0 if there is none.
+# From start and end of a cell of two numbers or more, how much a cut gains, and after how many of them.
 _BestCut = Callable[[int, int], tuple[float, int]]
 
 
 def _cells(best_cut: _BestCut, size: int, count: int) -> list[tuple[int, int]]:
     """Start and end of at most ``count`` cells of ``size`` numbers, cut out of one cell of all."""
-    gain, cut = best_cut(0, size)
-    heap = [(-gain, 0, cut, size)]
+    heap: list[tuple[float, int, int, int]] = []
+
+    def add(start: int, end: int) -> None:
+        gain, place = best_cut(start, end) if end - start > 1 else (-1.0, 0)
+        heapq.heappush(heap, (-gain, start, start + place, end))
+
+    add(0, size)
     while len(heap) < count and heap[0][0] <= 0:
         _, start, cut, end = heapq.heappop(heap)
-        for first, last in ((start, cut), (cut, end)):
-            gain, inner = best_cut(first, last)
-            heapq.heappush(heap, (-gain, first, inner, last))
+        add(start, cut)
+        add(cut, end)
     return [(start, end) for _, start, _, end in heap]
 
 
-class _Sums:
-    """Sums over runs of numbers in an order, each run a cell."""
+def _best(left: Float64s, right: Float64s, left_sum: Float64s, right_sum: Float64s, mass: float) -> tuple[float, int]:
+    """How much the sum of squares of a cell falls at most if it is cut in two, -1 if it does not fall, and where.
 
-    def __init__(self, numbers: Float64s, mass: Arrays) -> None:
-        self.mass = np.concatenate([[0.0], mass.cumsum()])
-        self.sum = np.concatenate([[0.0], (mass * numbers).cumsum()])
-
-    def best_cut(self, start: int, end: int) -> tuple[float, int]:
-        """How much the sum of squares falls at most if a cell is cut in two, and where; -1 if it does not fall."""
-        if end - start < 2:
-            return -1.0, start
-        cuts = slice(start + 1, end)
-        left = self.mass[cuts] - self.mass[start]
-        right = self.mass[end] - self.mass[cuts]
-        left_mean = (self.sum[cuts] - self.sum[start]) / left
-        right_mean = (self.sum[end] - self.sum[cuts]) / right
-        gains = np.square(left_mean - right_mean) * (left * right / (self.mass[end] - self.mass[start]))
-        best = int(gains.argmax())
-        return float(gains[best]) or -1.0, start + 1 + best  # equal numbers gain nothing
+    Args:
+        left: Mass left of each place where it may be cut.
+        right: Mass right of it.
+        left_sum: Sum of the numbers left of it, times their mass.
+        right_sum: Sum right of it.
+        mass: Of the cell.
+    """
+    gains = np.square(left_sum / left - right_sum / right) * (left * right / mass)
+    best = int(gains.argmax())
+    return float(gains[best]) or -1.0, 1 + best  # equal numbers gain nothing
 
 
 def find_palette(rows: Float32s, weight: NDArray[np.number[Any]], count: int) -> tuple[Float32s, Int64s]:
@@ -79,8 +77,9 @@ def find_palette(rows: Float32s, weight: NDArray[np.number[Any]], count: int) ->
         _place_along(rows, wide, numbers, along)
         ranks = along.argsort(kind="stable")
         numbers[:] = numbers[ranks]
-        gain, cut = _Sums(along[ranks], wide[numbers]).best_cut(0, end - start)
-        return gain, start + cut
+        mass = wide[numbers].cumsum()
+        sums = (wide[numbers] * along[ranks]).cumsum()
+        return _best(mass[:-1], mass[-1] - mass[:-1], sums[:-1], sums[-1] - sums[:-1], mass[-1])
 
     labels = np.empty(len(rows), np.int64)
     for number, (start, end) in enumerate(_cells(best_cut, len(rows), count)):
@@ -169,14 +168,21 @@ def scalar_kmeans(values: Float32s, weight: Integers | int = 1, count: int = 256
     if len(numbers) <= count:
         return np.pad(numbers, (0, count - len(numbers)), "edge").astype(np.float32)
     middle = float(np.average(numbers, weights=mass))  # sums of differences from it lose no digits
-    sums = _Sums(numbers - middle, mass)
+    mass = np.concatenate([[0.0], mass.cumsum()])
+    sums = np.concatenate([[0.0], (np.diff(mass) * (numbers - middle)).cumsum()])
+
+    def best_cut(start: int, end: int) -> tuple[float, int]:
+        cuts = slice(start + 1, end)
+        left = mass[cuts] - mass[start]
+        right = mass[end] - mass[cuts]
+        return _best(left, right, sums[cuts] - sums[start], sums[end] - sums[cuts], mass[end] - mass[start])
 
     def means(ends: Integers, empty: Float64s) -> Float64s:
         """Means ``[C]`` of the cells between ``ends [C + 1]``; for a cell without values, that of ``empty [C]``."""
-        mass = np.diff(sums.mass[ends])
-        return np.where(mass > 0, np.diff(sums.sum[ends]) / np.where(mass > 0, mass, 1) + middle, empty)
+        inside = np.diff(mass[ends])
+        return np.where(inside > 0, np.diff(sums[ends]) / np.where(inside > 0, inside, 1) + middle, empty)
 
-    starts = sorted(start for start, _ in _cells(sums.best_cut, len(numbers), count))
+    starts = sorted(start for start, _ in _cells(best_cut, len(numbers), count))
     levels = means(np.array([*starts, len(numbers)]), np.zeros(count))
     for _ in range(500):  # each costs one search of 256 borders, whatever the number of values
         borders = np.searchsorted(numbers, _borders(levels))

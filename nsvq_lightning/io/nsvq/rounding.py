@@ -1,4 +1,4 @@
-"""A scene as integers, which level ``compact`` rounds it to before anything is coded, and the order of codes.
+"""A scene as the integers that level ``compact`` rounds it to before anything is coded.
 
 Steps of positions and of codebooks are powers of two. So rounding is idempotent: a scene read from a file is written
 again without another error.
@@ -61,11 +61,12 @@ def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
         return Stored(AttributeEntry("opacities", 1, "levels", count), values)
     if name in scene.bases:
         basis = scene.bases[name]
-        step = min(_step(basis, nearest_power(float(np.abs(basis).max()) * 2.0**-13 or 1.0)), 1.0)
+        step = min(1.0, _step(basis, float(np.abs(basis).max()) * 2.0**-13 or 1.0))
         entry = AttributeEntry(name, basis.shape[1], "components", len(basis), step)
         return Stored(entry, _integers(name, scene.raw[name], 1.0, SMALL), _integers(name, basis, step, SMALL))
     if name in scene.raw:
-        rows, step = scene.raw[name], 2 * precision.of(name)
+        rows = scene.raw[name]
+        step = 2 * precision.of(name)
         return Stored(AttributeEntry(name, rows.shape[1], "steps", step=step), _integers(name, rows, step))
     return _coded(name, scene.codes[name], scene.codebooks[name], precision.codebook)
 
@@ -73,20 +74,22 @@ def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
 def _coded(name: str, codes: Integers, codebook: Float32s, error: float) -> Stored:
     used = np.bincount(codes, minlength=len(codebook)) > 0
     rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
-    distinct = np.unique(unit(rows).astype(np.float32) if name == "quats" else rows, axis=0)
-    step = _step(rows, nearest_power(2 * error * sibling_distance(distinct[tree_order(distinct)]) or 2.0**-16))
+    directions = unit(rows).astype(np.float32) if name == "quats" else rows
+    distinct = np.unique(directions, axis=0)
+    distance = sibling_distance(distinct[tree_order(distinct)])
+    step = _step(rows, 2 * error * distance or 2.0**-16)
     integers, merged = np.unique(_integers(name, rows, step), axis=0, return_inverse=True)
     order = tree_order((integers * step).astype(np.float32))
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
+    new_codes = order.argsort()[merged.reshape(-1)]
     entry = AttributeEntry(name, rows.shape[1], "codes", len(integers), step)
-    return Stored(entry, place[merged.reshape(-1)[np.cumsum(used)[codes] - 1]], integers[order])
+    return Stored(entry, new_codes[np.cumsum(used)[codes] - 1], integers[order])
 
 
 def _step(rows: Float32s, wanted: float) -> float:
-    """The lattice which all values lie on already, unless it is over four times finer than ``wanted``: then this."""
+    """The power of two near ``wanted``, or the lattice which all values lie on already if it is not far finer."""
+    power = nearest_power(wanted)
     lattice = coarsest_power(rows)
-    return lattice if 4 * lattice >= wanted else wanted
+    return lattice if 4 * lattice >= power else power
 
 
 def _integers(name: str, rows: Float32s, step: float, limit: float = 2.0**52) -> Int64s:
