@@ -59,7 +59,8 @@ class CompressedScene:
     bases: Mapping[str, Float32s] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        n, dims = len(self.means), splat.attribute_dims(self.sh_degree)
+        n = len(self.means)
+        dims = splat.attribute_dims(self.sh_degree)
         _check_floats("means", self.means, (n, 3))
         _check_floats("opacities", self.opacities, (n,))
         if len(self.origin) != 3 or not np.isfinite(self.origin).all():
@@ -73,8 +74,9 @@ class CompressedScene:
             )
         if not set(self.bases) <= {"shN"} & set(self.raw):
             raise ValueError(f"only shN may have a basis, and then no codebook; got bases of {sorted(self.bases)}")
+        widths = dims | {name: len(basis) for name, basis in self.bases.items()}
         for name, values in self.raw.items():
-            _check_floats(f"raw[{name!r}]", values, (n, len(self.bases[name]) if name in self.bases else dims[name]))
+            _check_floats(f"raw[{name!r}]", values, (n, widths[name]))
         for name, basis in self.bases.items():
             _check_floats(f"bases[{name!r}]", basis, (max(1, min(len(basis), dims[name])), dims[name]))
         for name, codes in self.codes.items():
@@ -219,12 +221,11 @@ class CompressedScene:
 
     def in_use(self) -> "CompressedScene":
         """The same splats, with codebooks of only the rows that they use; without splats, of the first one."""
-        rows = {name: np.unique(codes, return_inverse=True) for name, codes in self.codes.items()}
-        return replace(
-            self,
-            codes={name: codes for name, (_, codes) in rows.items()},
-            codebooks={name: self.codebooks[name][used if len(used) else [0]] for name, (used, _) in rows.items()},
-        )
+        codes, codebooks = {}, {}
+        for name, rows in self.codes.items():
+            used, codes[name] = np.unique(rows, return_inverse=True)
+            codebooks[name] = self.codebooks[name][used if len(used) else [0]]
+        return replace(self, codes=codes, codebooks=codebooks)
 
     def in_morton_order(self) -> "CompressedScene":
         """The splats in Morton order of their positions, in which many formats hold them: what is near follows."""
@@ -351,16 +352,19 @@ def attribute_errors(read: CompressedScene, written: CompressedScene) -> dict[st
         ``sh0`` and ``shN``; 0 where there is nothing to compare.
     """
     read = read.with_degree(written.sh_degree)
-    differences = {name: read.rows(name) - written.rows(name).astype(np.float64) for name in splat.ATTRIBUTES}
     units = unit(read.rows("quats"))
     others = unit(written.rows("quats"))
     nearer = np.minimum(np.linalg.norm(units - others, axis=1), np.linalg.norm(units + others, axis=1))
+
+    def difference(name: str) -> Float64s:
+        return read.rows(name) - written.rows(name).astype(np.float64)
+
     errors = {
-        "position": differences["means"],
+        "position": difference("means"),
         "rotation": np.degrees(4 * np.arcsin(np.minimum(nearer / 2, 1))),
-        "log-scale": differences["scales"],
+        "log-scale": difference("scales"),
         "opacity": opacity_of(read.opacities) - opacity_of(written.opacities),
-        "sh0": differences["sh0"],
-        "shN": differences["shN"],
+        "sh0": difference("sh0"),
+        "shN": difference("shN"),
     }
     return {name: float(np.sqrt(np.mean(np.square(error)))) if error.size else 0.0 for name, error in errors.items()}

@@ -50,7 +50,11 @@ def wrong_start(suffix: str, data: bytes, magic: bytes) -> FormatError:
     return FormatError(f"{cut}not a {suffix} file: it does not start with {magic.decode('latin-1')!r}")
 
 
-def json_object(text: bytes, name: str) -> dict[str, Any]:
+# An object of JSON.
+Json = dict[str, Any]
+
+
+def json_object(text: bytes, name: str) -> Json:
     """The object that a file, or a part of one of this name, holds as JSON.
 
     Raises:

@@ -11,7 +11,7 @@ import numpy as np
 from nsvq_lightning.io import glb, lod, ply, sog, splat, spz, usda
 from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import naming_file
+from nsvq_lightning.io.errors import Json, naming_file
 from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.header import describe_nsvq
 from nsvq_lightning.io.nsvq.precision import Storage
@@ -116,7 +116,7 @@ def save(
     return entry.write(path, scene, **options)
 
 
-def describe(path: StrPath) -> dict[str, Any]:
+def describe(path: StrPath) -> Json:
     """Facts about a file, as JSON values.
 
     Raises:

@@ -10,21 +10,17 @@ import logging
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, check_room, json_object, naming_file, wrong_start
+from nsvq_lightning.io.errors import FormatError, Json, check_room, json_object, naming_file, wrong_start
 from nsvq_lightning.io.numbers import finite_logs, logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, moved, rotated
 from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s, sh_coefficients, unit
 
 log = logging.getLogger(__name__)
-
-# An object of JSON.
-_Json = dict[str, Any]
 
 EXTENSION = "KHR_gaussian_splatting"
 OPACITY = f"{EXTENSION}:OPACITY"
@@ -66,8 +62,8 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
     for number, coefficients in enumerate(scene.values("shN").swapaxes(0, 1), 1):
         arrays[_harmonic(number)] = coefficients
     kinds = {width: name for name, width in _WIDTHS.items()}
-    views: list[_Json] = []
-    accessors: list[_Json] = []
+    views: list[Json] = []
+    accessors: list[Json] = []
     end = 0
     for number, values in enumerate(arrays.values()):
         is_byte = values.dtype == np.uint8
@@ -91,7 +87,7 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
     }
     attributes = {name: number for number, name in enumerate(arrays)}
     primitive = {"mode": 0, "attributes": attributes, "extensions": {EXTENSION: about}}
-    asset: _Json = {"version": "2.0", "generator": "nsvq-lightning"}
+    asset: Json = {"version": "2.0", "generator": "nsvq-lightning"}
     if scene.antialiased:
         asset["extras"] = {"antialiased": True}
     document = {
@@ -144,7 +140,7 @@ def read_glb(path: StrPath) -> CompressedScene:
 _MAX_JSON = 1 << 26
 
 
-def _parsed(data: bytes) -> tuple[_Json, memoryview]:
+def _parsed(data: bytes) -> tuple[Json, memoryview]:
     """JSON and binary chunk."""
     if len(data) < _HEAD.size + _CHUNK.size or data[:4] != b"glTF":
         raise wrong_start(".glb", data, b"glTF")
@@ -157,7 +153,7 @@ def _parsed(data: bytes) -> tuple[_Json, memoryview]:
     return json_object(data[start:end], "the first chunk"), memoryview(data)[end + _CHUNK.size :]
 
 
-def _primitives(document: _Json) -> Iterator[tuple[_Json, Float64s]]:
+def _primitives(document: Json) -> Iterator[tuple[Json, Float64s]]:
     """Those with splats, and the matrix ``[4, 4]`` of the node that each is in."""
     nodes = document["nodes"]
     roots = document["scenes"][document.get("scene", 0)]["nodes"]
@@ -178,7 +174,7 @@ def _primitives(document: _Json) -> Iterator[tuple[_Json, Float64s]]:
                 yield primitive, matrix
 
 
-def _matrix(node: _Json) -> Float64s:
+def _matrix(node: Json) -> Float64s:
     """What a node does to what is in it ``[4, 4]``."""
     from scipy.spatial.transform import Rotation
 
@@ -191,7 +187,7 @@ def _matrix(node: _Json) -> Float64s:
     return matrix
 
 
-def _splats(document: _Json, data: memoryview, primitive: _Json) -> CompressedScene:
+def _splats(document: Json, data: memoryview, primitive: Json) -> CompressedScene:
     """The splats of a primitive, in the axes of the file."""
     about = primitive["extensions"][EXTENSION]
     if inner := about.get("extensions"):
@@ -236,7 +232,7 @@ def _logs_of_scale(scale: Float32s) -> Float32s:
     return finite_logs(scale)
 
 
-def _accessor(document: _Json, data: memoryview, number: int) -> Float32s:
+def _accessor(document: Json, data: memoryview, number: int) -> Float32s:
     """Rows ``[N, D]`` of an accessor."""
     accessor = document["accessors"][number]
     view = document["bufferViews"][accessor["bufferView"]]

@@ -13,13 +13,12 @@ from contextlib import suppress
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath, write_bytes, write_text
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, naming_file
+from nsvq_lightning.io.errors import FormatError, Json, naming_file
 from nsvq_lightning.io.sog import META, PALETTE_LIMIT, read_sog, sog_contents
 from nsvq_lightning.splats.conventions import Float64s, Integers, unit
 
@@ -101,10 +100,9 @@ def in_lod_order(scene: CompressedScene) -> CompressedScene:
 
 # Most splats of the finest level in a leaf, and of any level in a file.
 LEAF, FILE = 1 << 14, 1 << 17
-_Node = dict[str, Any]
 
 
-def _tree(levels: Sequence[CompressedScene]) -> tuple[_Node, list[tuple[list[Integers], _Node]]]:
+def _tree(levels: Sequence[CompressedScene]) -> tuple[Json, list[tuple[list[Integers], Json]]]:
     """The root, and in their order the leaves with the splats of each level in them."""
     from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
 
@@ -112,11 +110,11 @@ def _tree(levels: Sequence[CompressedScene]) -> tuple[_Node, list[tuple[list[Int
     means = np.concatenate([level.means for level in levels])
     boxes = np.concatenate([_boxes(level) for level in levels])
     starts = np.cumsum([0, *map(len, levels)])
-    leaves: list[tuple[list[Integers], _Node]] = []
+    leaves: list[tuple[list[Integers], Json]] = []
 
-    def node(splats: Integers) -> _Node:
+    def node(splats: Integers) -> Json:
         low, high = boxes[splats, 0].min(0), boxes[splats, 1].max(0)
-        found: _Node = {"bound": {"min": _decimals(low), "max": _decimals(high)}}
+        found: Json = {"bound": {"min": _decimals(low), "max": _decimals(high)}}
         finest, *coarser = np.split(splats, np.searchsorted(splats, starts[1:-1]))
         axis = int(means[finest].std(0).argmax())
         middle = np.median(means[finest, axis])
@@ -149,9 +147,9 @@ def _boxes(scene: CompressedScene) -> Float64s:
     return np.stack([scene.means - reach, scene.means + reach], axis=1)
 
 
-def _files(runs: list[tuple[Integers, _Node]]) -> Iterator[list[tuple[Integers, _Node]]]:
+def _files(runs: list[tuple[Integers, Json]]) -> Iterator[list[tuple[Integers, Json]]]:
     """The leaves with any splats, by the file that they share."""
-    some: list[tuple[Integers, _Node]] = []
+    some: list[tuple[Integers, Json]] = []
     count = 0
     for rows, node in runs:
         if some and count + len(rows) > FILE:

@@ -50,7 +50,7 @@ class Grid:
     def cells(self, means: Float32s) -> tuple[Int64s, Bools]:
         """Cell of each position ``[N, 3]``, 0 for those outside; and which ``[N]`` are inside."""
         cells = np.floor(means.astype(np.float64) / self.step) - np.array(self.base, np.float64)
-        inside = np.logical_and.reduce((cells >= 0) & (cells < 1 << AXIS_BITS), axis=1)
+        inside = ((cells >= 0) & (cells < 1 << AXIS_BITS)).all(1)
         return np.where(inside[:, None], cells, 0).astype(np.int64), inside
 
     def depths(self, doublings: Float64s) -> Int64s:
@@ -162,17 +162,21 @@ def _search_before(axes, found):  # type: ignore[no-untyped-def]
         end = min(start + _BLOCK, count)
         # A distance and, for equal ones, the place in the window in one number, exact in float64: two minima without
         # branches, in vectors along the rows.
-        first, second = np.full(_BLOCK, _NONE), np.full(_BLOCK, _NONE)
+        first = np.full(_BLOCK, _NONE)
+        second = np.full(_BLOCK, _NONE)
         for back in range(1, _WINDOW + 1):
             for i in range(max(start, back), end):
-                x, y, z = axes[0, i] - axes[0, i - back], axes[1, i] - axes[1, i - back], axes[2, i] - axes[2, i - back]
+                x = axes[0, i] - axes[0, i - back]
+                y = axes[1, i] - axes[1, i - back]
+                z = axes[2, i] - axes[2, i - back]
                 found_now = (x * x + y * y + z * z) * _WINDOW + (_WINDOW - back)
                 least = first[i - start]
                 later = found_now if least < found_now else least
                 first[i - start] = found_now if found_now < least else least
                 second[i - start] = later if later < second[i - start] else second[i - start]
         for i in range(start, end):
-            found[i, 0], found[i, 1] = _row(i, first[i - start]), _row(i, second[i - start])
+            found[i, 0] = _row(i, first[i - start])
+            found[i, 1] = _row(i, second[i - start])
 
 
 @inline

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, check_room, json_object, naming_file, wrong_start
+from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, Json, check_room, json_object, naming_file, wrong_start
 from nsvq_lightning.io.numbers import bytes_of, logits_of_bytes, opacity_of
 from nsvq_lightning.splats.conventions import (
     Arrays,
@@ -87,7 +87,6 @@ def sog_contents(scene: CompressedScene, palette: int = PALETTE_LIMIT) -> dict[s
 
     if not 1 <= palette <= PALETTE_LIMIT:
         raise ValueError(f"palette must be in 1..{PALETTE_LIMIT}, got {palette}")
-    count = len(scene)
     low, high, means = _packed_means(scene.means)
     scales, scale_levels = _leveled(scene.rows("scales"))
     colors, color_levels = _leveled(scene.rows("sh0"))
@@ -98,10 +97,10 @@ def sog_contents(scene: CompressedScene, palette: int = PALETTE_LIMIT) -> dict[s
         "scales.webp": scales,
         "sh0.webp": np.c_[colors, bytes_of(scene.opacities)],
     }
-    meta: dict[str, Any] = {
+    meta: Json = {
         "version": 2,
         "asset": {"generator": "nsvq-lightning"},
-        "count": count,
+        "count": len(scene),
         # The second is how it was said before; readers know one of them.
         **({"model": "antialiased", "antialias": True} if scene.antialiased else {}),
         "means": {**means, "files": ["means_l.webp", "means_u.webp"]},
@@ -109,7 +108,7 @@ def sog_contents(scene: CompressedScene, palette: int = PALETTE_LIMIT) -> dict[s
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_levels, "files": ["sh0.webp"]},
     }
-    pictures = {name: _picture(values, picture_shape(count)) for name, values in texels.items()}
+    pictures = {name: _picture(values) for name, values in texels.items()}
     if scene.sh_degree:
         meta["shN"], sh_pictures = _packed_sh(*_palette(scene, palette), scene.sh_degree)
         pictures |= sh_pictures
@@ -196,7 +195,7 @@ class _Archive:
         except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, ValueError, struct.error) as error:
             raise FormatError(f"damaged: {name} cannot be unpacked ({error})") from None
 
-    def _entry(self, name: str) -> dict[str, Any]:
+    def _entry(self, name: str) -> Json:
         entry = self.meta.get(name)
         if not isinstance(entry, dict):
             raise FormatError(f"damaged: {META} has no object {name!r}")
@@ -209,9 +208,9 @@ class _Archive:
             raise FormatError(f"damaged: {name!r} in {META} must be an integer in {low}..{high}, got {str(value)[:40]}")
         return value
 
-    def _numbers(self, attribute: str, name: str, count: range, largest: float) -> Float64s:
-        values = self._entry(attribute).get(name)
-        values = [np.nan if value is None else value for value in (values if isinstance(values, list) else [values])]
+    def _numbers(self, attribute: str, name: str, count: range, largest: float = _LARGEST) -> Float64s:
+        found = self._entry(attribute).get(name)
+        values = [np.nan if value is None else value for value in (found if isinstance(found, list) else [found])]
         if len(values) not in count:
             raise FormatError(f"damaged: {name!r} in {META} must be a list of {count[0]} to {count[-1]} numbers")
         if not all(type(value) in (int, float) and not abs(value) > largest for value in values):
@@ -220,7 +219,8 @@ class _Archive:
 
     def texels(self, attribute: str, number: int = 0, count: int | None = None) -> Uint8s:
         """The first ``count`` texels ``[count, 4]`` of one of the pictures of an attribute; one a splat if None."""
-        picture, count = self._picture(attribute, number), self.count if count is None else count
+        picture = self._picture(attribute, number)
+        count = self.count if count is None else count
         height, width = picture.shape[:2]
         if width * height < count:
             raise FormatError(f"damaged: a picture of {attribute} has {width} x {height} texels, {count} are needed")
@@ -249,7 +249,7 @@ class _Archive:
         """The values ``[N, C]`` of an attribute that texels ``[N, C]`` have the level indices of."""
         if self.version == 1:
             ends = 1 if attribute == "shN" else texels.shape[1]
-            low, high = (self._numbers(attribute, end, range(ends, ends + 1), _LARGEST) for end in ("mins", "maxs"))
+            low, high = (self._numbers(attribute, end, range(ends, ends + 1)) for end in ("mins", "maxs"))
             return (low + (high - low) * (texels / 255)).astype(np.float32)
         levels = self._levels(attribute)
         if texels.size and texels.max() >= len(levels):
@@ -258,7 +258,7 @@ class _Archive:
 
     def _levels(self, attribute: str) -> Float64s:
         """The codebook of an attribute; levels that are null, as older writers left NaN, in line with the others."""
-        levels = self._numbers(attribute, "codebook", range(1, _LEVELS + 1), _LARGEST)
+        levels = self._numbers(attribute, "codebook", range(1, _LEVELS + 1))
         known = np.flatnonzero(np.isfinite(levels))
         if len(known) == len(levels):
             return levels
@@ -331,13 +331,12 @@ def _visibility(scene: CompressedScene) -> Float64s:
     Every splat counts a little, however small it is compared with the largest.
     """
     sizes = np.sort(scene.rows("scales"), axis=1)[:, 1:].mean(1).astype(np.float64)
-    weight: Float64s = opacity_of(scene.opacities) * np.exp(sizes - sizes.max())
+    weight = opacity_of(scene.opacities) * np.exp(sizes - sizes.max())
     return weight / float(weight.mean()) + 0.01
 
 
-def _packed_means(
-    means: Float32s,
-) -> tuple[Uint8s, Uint8s, dict[str, list[float]]]:
+def _packed_means(means: Float32s) -> tuple[Uint8s, Uint8s, dict[str, list[float]]]:
+    """Low and high bytes of positions ``[N, 3]``, and what ``meta.json`` says of them."""
     wide = means.astype(np.float64)
     logs = np.copysign(np.log1p(np.abs(wide)), wide)
     low, high = logs.min(0), logs.max(0)
@@ -367,22 +366,24 @@ def _leveled(values: Float32s, weight: Integers | int = 1) -> tuple[Uint8s, list
     return nearest_level(values, levels), [float(str(level)) for level in levels]
 
 
-def _packed_sh(rows: Float32s, labels: Int64s, sh_degree: int) -> tuple[dict[str, Any], dict[str, Uint8s]]:
+def _packed_sh(rows: Float32s, labels: Int64s, sh_degree: int) -> tuple[Json, dict[str, Uint8s]]:
     """What ``meta.json`` says of a palette ``[K, D]`` and labels ``[N]``, and their pictures by name."""
     indices, levels = _leveled(rows, np.bincount(labels, minlength=len(rows))[:, None])
-    names = ["shN_centroids.webp", "shN_labels.webp"]
-    meta = {"count": len(rows), "bands": sh_degree, "codebook": levels, "files": names}
     shape = math.ceil(len(rows) / _ROWS_A_LINE), _ROWS_A_LINE * sh_coefficients(sh_degree)
-    centroids = _picture(indices.reshape(-1, 3), shape)
-    return meta, {names[0]: centroids, names[1]: _picture(_low_and_high(labels), picture_shape(len(labels)))}
+    pictures = {
+        "shN_centroids.webp": _picture(indices.reshape(-1, 3), shape),
+        "shN_labels.webp": _picture(_low_and_high(labels)),
+    }
+    return {"count": len(rows), "bands": sh_degree, "codebook": levels, "files": list(pictures)}, pictures
 
 
-def _picture(texels: Uint8s, shape: tuple[int, int]) -> Uint8s:
-    """Texels ``[N, C]`` as a picture ``[H, W, 4]``; missing texels are black and opaque."""
-    picture = np.zeros((shape[0] * shape[1], 4), np.uint8)
+def _picture(texels: Uint8s, shape: tuple[int, int] | None = None) -> Uint8s:
+    """Texels ``[N, C]`` as a picture ``[H, W, 4]``, nearly square by default; missing texels are black and opaque."""
+    height, width = shape or picture_shape(len(texels))
+    picture = np.zeros((height * width, 4), np.uint8)
     picture[:, 3] = 255
     picture[: len(texels), : texels.shape[1]] = texels
-    return picture.reshape(*shape, 4)
+    return picture.reshape(height, width, 4)
 
 
 _PICTURES = (".webp", ".png")
@@ -392,7 +393,8 @@ def _archived(path: Path) -> tuple[bytes, int]:
     """The zip archive and its size; of a folder, whose ``meta.json`` is given, one with the pictures in it."""
     if path.suffix.lower() != ".json":
         return path.read_bytes(), path.stat().st_size
-    buffer, text = io.BytesIO(), path.read_text(encoding="utf-8", errors="replace")
+    buffer = io.BytesIO()
+    text = path.read_text(encoding="utf-8", errors="replace")
     pictures = [each for each in path.parent.glob("*.*") if each.suffix.lower() in _PICTURES and each.name in text]
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.write(path, META)

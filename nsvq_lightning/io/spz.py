@@ -77,14 +77,19 @@ class SpzHeader:
     @property
     def sizes(self) -> dict[str, int]:
         """Bytes per splat of each array, in file order."""
-        means, quats = (6 if self.version == 1 else 9), (4 if self.version >= 3 else 3)
-        sh = 3 * ((self.sh_degree + 1) ** 2 - 1)
-        return {"means": means, "opacities": 1, "sh0": 3, "scales": 3, "quats": quats, "shN": sh}
+        return {
+            "means": 6 if self.version == 1 else 9,
+            "opacities": 1,
+            "sh0": 3,
+            "scales": 3,
+            "quats": 4 if self.version >= 3 else 3,
+            "shN": 3 * ((self.sh_degree + 1) ** 2 - 1),
+        }
 
     @property
     def streams(self) -> dict[str, int]:
         """Bytes of each array that is not empty, in file order: the streams of version 4."""
-        return {name: self.count * size for name, size in self.sizes.items() if self.count * size}
+        return {name: self.count * size for name, size in self.sizes.items() if self.count and size}
 
 
 _MAGIC, _GZIP = b"NGSP", b"\x1f\x8b"
@@ -104,8 +109,8 @@ _EXTENSION = struct.Struct("<III")
 _AXES = 0xADBE0003
 # Axes by the number that the extension holds; 0 says nothing.
 _SYSTEMS = (
-    *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
-    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
+    "",
+    *["LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"],
 )
 # Coordinates that the real spherical harmonics of degree 1 to 3 are odd functions of.
 _ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
@@ -114,14 +119,18 @@ _ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z",
 def _write_frame(path: StrPath, header: SpzHeader, arrays: Mapping[str, Arrays]) -> int:
     """Write header and arrays, by the names of :attr:`SpzHeader.sizes`; returns the bytes of the file."""
     contents = [np.ascontiguousarray(arrays[name]).data.cast("B") for name in header.streams]
-    axes = _EXTENSION.pack(_AXES, 4, _SYSTEMS.index(header.axes)) if header.axes else b""
-    flags, count = header.flags | (_EXTENDED if axes else 0), len(contents) if header.version == 4 else 0
+    axes = b""
+    flags = header.flags
+    if header.axes:
+        axes = _EXTENSION.pack(_AXES, 4, _SYSTEMS.index(header.axes))
+        flags |= _EXTENDED
+    count = len(contents) if header.version == 4 else 0
     start = _HEADER.pack(_MAGIC, header.version, header.count, header.sh_degree, header.fraction_bits, flags, count)
     with atomic_write(path) as file:
         if header.version == 4:
             with naming_file(path):
                 streams = [zstd_compress(content) for content in contents]
-            table = (_ENTRY.pack(len(s), len(c)) for s, c in zip(streams, contents, strict=True))
+            table = [_ENTRY.pack(len(s), len(c)) for s, c in zip(streams, contents, strict=True)]
             file.writelines([start, _TABLE_OFFSET.pack(_HEAD + len(axes)), axes, *table, *streams])
         else:
             # No file name and no time stamp: the same scene gives the same bytes.
@@ -145,7 +154,8 @@ def _table(data: bytes) -> tuple[SpzHeader, dict[str, int]]:
     header = _parse(data[: _HEADER.size], len(data))
     if header.version < 4 or len(data) < _HEAD:
         raise FormatError(f"truncated or damaged: version {header.version} in {len(data)} bytes without gzip")
-    streams, (offset,) = data[_HEADER.size - 1], _TABLE_OFFSET.unpack_from(data, _HEADER.size)
+    streams = data[_HEADER.size - 1]
+    (offset,) = _TABLE_OFFSET.unpack_from(data, _HEADER.size)
     if streams != len(header.streams):
         raise FormatError(f"damaged: {streams} streams where there must be {len(header.streams)}")
     start = offset + _ENTRY.size * streams
@@ -241,7 +251,8 @@ def _inflate(gunzip: "zlib._Decompress", data: bytes, most: int) -> bytes:
 
 
 # Bits of a position, and the largest number of them that are fractional.
-_POSITION, MAX_FRACTION = 24, 30
+_POSITION = 24
+MAX_FRACTION = 30
 
 
 def _parse(start: bytes, file_bytes: int) -> SpzHeader:
@@ -265,9 +276,10 @@ def _signs(axes: str, sh_degree: int) -> tuple[Float32s, Float32s, Float32s]:
     Returns:
         Signs of positions ``[3]``, of quaternions wxyz ``[4]``, and of all spherical harmonics ``[D]``.
     """
-    xyz = np.array([1 if a == b else -1 for a, b in zip(axes, "RDF", strict=True)], np.float32)
+    sign = {axis: 1 if a == b else -1 for axis, a, b in zip("xyz", axes, "RDF", strict=True)}
+    xyz = np.array([*sign.values()], np.float32)
     odd = _ODD[: conventions.sh_coefficients(sh_degree)]
-    harmonics = np.array([math.prod(xyz["xyz".index(axis)] for axis in names) for names in odd], np.float32)
+    harmonics = np.array([math.prod(sign[axis] for axis in names) for names in odd], np.float32)
     # A rotation's axis does not mirror as positions do.
     return xyz, np.array([1, *(xyz.prod() * xyz)], np.float32), harmonics.repeat(3)
 
@@ -350,9 +362,10 @@ def _fraction_bits(scene: CompressedScene) -> int:
     sizes = scene.rows("scales").mean(1)
     # No coordinate is off by more than a twentieth of the splat's size, but for the smallest thousandth of the splats.
     needed = math.ceil(-(math.log2(2 * 0.05) + float(np.quantile(sizes, 0.001)) / math.log(2)))
-    farthest, far = np.abs(scene.means).max(), np.quantile(np.abs(scene.means).max(1), 0.999)
-    fits, mostly_fits = (_POSITION - 1 - math.frexp(float(reach))[1] for reach in (farthest, far))
-    return min(max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0), MAX_FRACTION)
+    reach = np.abs(scene.means).max(1)
+    fits, mostly_fits = (_POSITION - 1 - math.frexp(end)[1] for end in (reach.max(), np.quantile(reach, 0.999)))
+    bits = max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0)
+    return min(bits, MAX_FRACTION)
 
 
 def _packed(scene: CompressedScene, name: str, factor: float | Float32s, zero: float, clamped: Clamped) -> Uint8s:

@@ -8,14 +8,13 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
 from nsvq_lightning.io.numbers import logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, UP_AXES, moved, rotated
-from nsvq_lightning.splats.conventions import Float32s, Float64s, sh_coefficients, unit
+from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, sh_coefficients, unit
 
 log = logging.getLogger(__name__)
 
@@ -34,18 +33,15 @@ def write_usda(path: StrPath, scene: CompressedScene) -> int:
     scene = rotated(scene, HALF_TURN)
     colors = np.concatenate([scene.rows("sh0"), scene.rows("shN")], axis=1)
     per_splat = sh_coefficients(scene.sh_degree) + 1
-    arrays: list[tuple[str, NDArray[np.floating], str]] = [
-        ("point3f[] positions", scene.means, ""),
-        ("quatf[] orientations", unit(scene.rows("quats")), ""),
-        ("float3[] scales", np.exp(scene.rows("scales").astype(np.float64)), ""),
-        ("float[] opacities", opacity_of(scene.opacities)[:, None], ""),
-        (
-            f"float3[] {_COEFFICIENTS}",
-            colors.reshape(-1, 3),
-            f' (\n        elementSize = {per_splat}\n        interpolation = "vertex"\n    )',
-        ),
-        ("float3[] extent", np.stack([scene.means.min(0), scene.means.max(0)]), ""),
-    ]
+    arrays: dict[str, Arrays] = {
+        "point3f[] positions": scene.means,
+        "quatf[] orientations": unit(scene.rows("quats")),
+        "float3[] scales": np.exp(scene.rows("scales").astype(np.float64)),
+        "float[] opacities": opacity_of(scene.opacities)[:, None],
+        f"float3[] {_COEFFICIENTS}": colors.reshape(-1, 3),
+        "float3[] extent": np.stack([scene.means.min(0), scene.means.max(0)]),
+    }
+    about_colors = f' (\n        elementSize = {per_splat}\n        interpolation = "vertex"\n    )'
     note = "    customData = { bool antialiased = 1 }\n" if scene.antialiased else ""
     with atomic_write(path) as file:
         file.write(
@@ -55,14 +51,16 @@ def write_usda(path: StrPath, scene: CompressedScene) -> int:
             '    uniform token projectionModeHint = "perspective"\n'
             '    uniform token sortingModeHint = "cameraDistance"\n'.encode()
         )
-        for name, values, details in arrays:
+        for name, values in arrays.items():
             file.write(f"    {name} = [".encode())
-            row = "(" + ", ".join(["%.9g"] * values.shape[1]) + ")" if values.shape[1] > 1 else "%.9g"
+            row = ", ".join(["%.9g"] * values.shape[1])
+            if values.shape[1] > 1:
+                row = f"({row})"
             for start in range(0, len(values), _ROWS):
                 block = values[start : start + _ROWS]
                 text = ", ".join([row] * len(block)) % tuple(block.ravel().tolist())
                 file.write((", " * bool(start) + text).encode())
-            file.write(f"]{details}\n".encode())
+            file.write(f"]{about_colors if _COEFFICIENTS in name else ''}\n".encode())
         file.write(b"}\n")
         return file.tell()
 

@@ -26,6 +26,7 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
 Values = Mapping[str, Any]
+Rows = Sequence[Values]
 
 
 @torch.no_grad()
@@ -66,7 +67,7 @@ def evaluate(
 def summarize(
     path: Path,
     scene: CompressedScene,
-    scores: Sequence[Values],
+    scores: Rows,
     lpips: tuple[float | None, str | None],
     module: SplatModule,
     paper: Values,
@@ -124,7 +125,7 @@ def _codes_in_use(codes: Integers, size: int) -> dict[str, Any]:
     return {"codebook": size, "used": len(shares), "entropy": float(-(shares * np.log2(shares)).sum()) + 0.0}
 
 
-def write_csv(path: Path, rows: Sequence[Values]) -> None:
+def write_csv(path: Path, rows: Rows) -> None:
     """Write rows with the same keys as CSV, atomically; the keys of the first row, in order, are the header."""
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
@@ -138,6 +139,8 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: Co
     columns = []
     for name, *cells in zip(head, *rows, strict=True):
         width = max(3, *map(len, (name, *cells)))
-        rule, pad = ("-" * width, str.ljust) if name in words else ("-" * (width - 1) + ":", str.rjust)
-        columns.append([pad(cell, width) for cell in (name, rule, *cells)])
+        if name in words:
+            columns.append([cell.ljust(width) for cell in (name, "-" * width, *cells)])
+        else:
+            columns.append([cell.rjust(width) for cell in (name, "-" * (width - 1) + ":", *cells)])
     return "\n".join(f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))

@@ -13,7 +13,7 @@ import torch
 from cv2.typing import MatLike
 
 from nsvq_lightning.io.atomic import write_text
-from nsvq_lightning.report.numbers import Values
+from nsvq_lightning.report.numbers import Rows, Values
 from nsvq_lightning.report.viewer import data_address, fill, script_json
 from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.version import __version__
@@ -24,11 +24,11 @@ NAME = "report.html"
 
 def write_page(
     folder: Path,
-    history: Sequence[Values],
+    history: Rows,
     schedule: Schedule,
     seconds: Mapping[str, float],
     metrics: Values | None = None,
-    views: Sequence[Values] = (),
+    views: Rows = (),
 ) -> Path:
     """Write the page of a run, atomically; without ``metrics``, browsers read it again every few seconds.
 
@@ -53,8 +53,9 @@ def write_page(
     if metrics is None and preview.exists():
         sections["Photo and render"] = f'<img class="wide" alt="photo and render" src="{_jpeg(_read(preview))}">'
     sections["While it trained"] = _curve(history, schedule) if history else ""
-    tables = _times(history, seconds) if metrics is None else _sizes(metrics) | _times(history, seconds)
-    sections |= {heading: _table(*table) for heading, table in tables.items()}
+    if metrics is not None:
+        sections |= {"Bytes": _streams(metrics), "Codes": _codes(metrics)}
+    sections["Time"] = _times(history, seconds)
     if config.exists():
         text = escape(config.read_text(encoding="utf-8"))
         sections["Settings"] = f"<details><summary>config.yaml</summary><pre>{text}</pre></details>"
@@ -74,7 +75,7 @@ def write_page(
     return folder / NAME
 
 
-def _facts(history: Sequence[Values], schedule: Schedule, metrics: Values | None) -> dict[str, str]:
+def _facts(history: Rows, schedule: Schedule, metrics: Values | None) -> dict[str, str]:
     """What a run has come to or, without ``metrics``, how far it has come."""
     last = metrics or history[-1]
     quality = {"test PSNR": _decibels(last["psnr"]), "SSIM": f"{last['ssim']:.4f}"}
@@ -92,70 +93,74 @@ def _facts(history: Sequence[Values], schedule: Schedule, metrics: Values | None
     }
 
 
-def _views(folder: Path, views: Sequence[Values]) -> str:
+def _views(folder: Path, views: Rows) -> str:
     """Photo, render and error of each view, which lie side by side in its picture; ``report.js`` adds the slider."""
     worst = min((row["psnr"] for row in views), default=0.0)
     figures = []
     for row in views:
         path = folder / "renders" / row["picture"]
-        if path.exists():
-            remark = ", the lowest" if row["psnr"] == worst and len(views) > 1 else ""
-            caption = f"{escape(row['name'])}: {_decibels(row['psnr'])}, SSIM {row['ssim']:.4f}{remark}"
-            parts = zip(("photo", "render", "error"), np.array_split(_read(path), 3, axis=1), strict=True)
-            pictures = "".join(f'<img alt="{part}" src="{_jpeg(picture)}">' for part, picture in parts)
-            figures.append(f"<figure>{pictures}<figcaption>{caption}</figcaption></figure>")
+        if not path.exists():
+            continue
+        remark = ", the lowest" if row["psnr"] == worst and len(views) > 1 else ""
+        caption = f"{escape(row['name'])}: {_decibels(row['psnr'])}, SSIM {row['ssim']:.4f}{remark}"
+        parts = zip(("photo", "render", "error"), np.array_split(_read(path), 3, axis=1), strict=True)
+        pictures = "".join(f'<img alt="{part}" src="{_jpeg(picture)}">' for part, picture in parts)
+        figures.append(f"<figure>{pictures}<figcaption>{caption}</figcaption></figure>")
     return f'<div class="views">{"".join(figures)}</div>' if figures else ""
 
 
-def _curve(history: Sequence[Values], schedule: Schedule) -> str:
+def _curve(history: Rows, schedule: Schedule) -> str:
     """What ``report.js`` draws."""
-    decibels = [entry["psnr"] if math.isfinite(entry["psnr"]) else None for entry in history]
-    rows = [[entry["iteration"], value, entry["splats"]] for entry, value in zip(history, decibels, strict=True)]
+    rows = []
+    for entry in history:
+        psnr = entry["psnr"] if math.isfinite(entry["psnr"]) else None
+        rows.append([entry["iteration"], psnr, entry["splats"]])
     phases = [[phase.name.lower(), end] for phase, end in zip(Phase, schedule.ends, strict=False)]
     data = script_json({"history": rows, "phases": phases})
     return f'<div id="curve" class="card"></div><script>const trained = {data};</script>'
 
 
-# Head and rows of a table.
-_Table = tuple[Sequence[str], Sequence[Sequence[str]]]
+def _streams(metrics: Values) -> str:
+    """The table of what is in the file."""
+    rows = []
+    for name, size in {**metrics["streams"], "whole file": metrics["file_bytes"]}.items():
+        if size:
+            bits = 8 * size / max(1, metrics["num_splats"])
+            bar = f'<i style="--share:{size / metrics["file_bytes"]:.4f}"></i>'
+            rows.append((name, f"{size:,}", f"{bits:.2f}", bar))
+    return _table(("stream", "bytes", "bits a splat", ""), rows)
 
 
-def _sizes(metrics: Values) -> dict[str, _Table]:
-    """The tables of the file by their headings."""
-    splats, whole = max(1, metrics["num_splats"]), metrics["file_bytes"]
-    streams = [
-        (name, f"{size:,}", f"{8 * size / splats:.2f}", f'<i style="--share:{size / whole:.4f}"></i>')
-        for name, size in {**metrics["streams"], "whole file": whole}.items()
-        if size
-    ]
-    codes = [
+def _codes(metrics: Values) -> str:
+    """The table of the codebooks."""
+    rows = [
         (name, f"{book['codebook']:,}", f"{book['used']:,}", f"{book['entropy']:.2f}")
         for name, book in metrics["codes"].items()
     ]
-    return {
-        "Bytes": (("stream", "bytes", "bits a splat", ""), streams),
-        "Codes": (("attribute", "codebook", "in use", "entropy, bits"), codes),
-    }
+    return _table(("attribute", "codebook", "in use", "entropy, bits"), rows)
 
 
-def _times(history: Sequence[Values], seconds: Mapping[str, float]) -> dict[str, _Table]:
-    """The table of times by its heading."""
+def _times(history: Rows, seconds: Mapping[str, float]) -> str:
+    """The table of times."""
     rows = []
     before, since = 0, 0.0
     for last in {entry["phase"]: entry for entry in history}.values():
-        steps, taken = last["iteration"] - before, last["seconds"] - since
+        steps = last["iteration"] - before
+        taken = last["seconds"] - since
         rows.append((last["phase"], f"{steps:,}", _duration(taken), f"{1000 * taken / steps:.1f}"))
         before, since = last["iteration"], last["seconds"]
     rows += [(name, "", _duration(taken), "") for name, taken in seconds.items() if taken]
-    return {"Time": (("part", "iterations", "time", "ms each"), rows)}
+    return _table(("part", "iterations", "time", "ms each"), rows)
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table; nothing without rows."""
-    lines = ["".join(f"<th>{cell}</th>" for cell in head)]
-    lines += ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
-    table = "".join(f"<tr>{line}</tr>" for line in lines)
-    return f'<div class="scroll"><table>{table}</table></div>' if rows else ""
+    if not rows:
+        return ""
+    table = "<tr>" + "".join(f"<th>{cell}</th>" for cell in head) + "</tr>"
+    for row in rows:
+        table += "<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>"
+    return f'<div class="scroll"><table>{table}</table></div>'
 
 
 def _read(path: Path) -> MatLike:
@@ -181,4 +186,6 @@ def _duration(seconds: float) -> str:
     hours, minutes = divmod(minutes, 60)
     if hours:
         return f"{hours} h {minutes} min"
-    return f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"
+    if minutes:
+        return f"{minutes} min {rest} s"
+    return f"{seconds:.1f} s"

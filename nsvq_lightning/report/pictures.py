@@ -124,9 +124,10 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
     log.info("%s: %s", path, "H.264" if program else "VP9")
     # Both programs tell the container by the suffix, which the unfinished file does not have.
     with atomic_path(path) as unfinished, tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        lossless, file = Path(folder) / "video.avi", Path(folder) / f"video{VIDEO}"
-        written, code = (lossless, "FFV1") if program else (file, "vp09")
-        video = cv2.VideoWriter(str(written), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*code), fps, (width, height))
+        file = Path(folder) / f"video{VIDEO}"
+        first = file.with_suffix(".avi") if program else file  # from which ffmpeg makes the other
+        code = "FFV1" if program else "vp09"
+        video = cv2.VideoWriter(str(first), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*code), fps, (width, height))
         if not video.isOpened():
             raise OSError(f"OpenCV cannot write {code} here: write PNGs into a folder")
         try:
@@ -135,7 +136,7 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
             video.release()
         if program:
             options = ["-c:v", "libx264", "-crf", "17", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
-            command = [program, "-loglevel", "error", "-i", str(lossless), *options, str(file)]
+            command = [program, "-loglevel", "error", "-i", str(first), *options, str(file)]
             ended = subprocess.run(command, capture_output=True, check=False, stdin=subprocess.DEVNULL)
             if ended.returncode:
                 raise OSError(f"ffmpeg could not write the video: {ended.stderr.decode(errors='replace').strip()}")
@@ -181,7 +182,8 @@ def curve_figure(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> An
     quality = figure.add_subplot()
     number = quality.twinx()
     iterations = [entry["iteration"] for entry in history]
-    start, colours = 0, ("#dfe8f5", "#f8e6d0", "#dcefdc", "#efe0f0")
+    colours = "#dfe8f5", "#f8e6d0", "#dcefdc", "#efe0f0"
+    start = 0
     for phase, end, colour in zip(Phase, schedule.ends, cycle(colours), strict=False):
         if end > start:
             quality.axvspan(start, end, color=colour, label=phase.name.lower(), linewidth=0)

@@ -80,13 +80,19 @@ def viewer_page(
         raise ValueError("a page needs at least one camera to start from, got none")
     if len(background) != 3 or not all(0 <= value <= 1 for value in background):
         raise ValueError(f"background must be three numbers from 0 to 1, got {list(background)}")
-    about, start, source = "", 0, f'<script data-seconds="{live}">\n{web_source("served.js")}</script>'
+    about = ""
+    start = 0
     if live is None or Path(scene_file).is_file():
-        stored, file = read_nsvq(scene_file), Path(scene_file).read_bytes()
-        about = f"{len(stored):,} splats, {len(file) / 1e6:.2f} MB. "
+        stored = read_nsvq(scene_file)
+        about = f"{len(stored):,} splats, {(stored.stored_bytes or 0) / 1e6:.2f} MB. "
         start = best_view(stored.decode(), list(cameras.values()))
-        if live is None:
-            source = f'<script id="file" type="text/plain">{base64.b64encode(file).decode()}</script>'
+    if live is None:
+        file = base64.b64encode(Path(scene_file).read_bytes()).decode()
+        source = f'<script id="file" type="text/plain">{file}</script>'
+        connect = ""
+    else:
+        source = f'<script data-seconds="{live}">\n{web_source("served.js")}</script>'
+        connect = " connect-src 'self';"
     scene = {
         "cameras": [{"name": name, **camera_entry(camera)} for name, camera in cameras.items()],
         "background": list(background),
@@ -94,9 +100,15 @@ def viewer_page(
         "near": min(camera.near for camera in cameras.values()),
         "start": start,
     }
-    name, connect = escape(title.encode("utf-8", "replace").decode()), "" if live is None else " connect-src 'self';"
-    parts = {"title": name, "about": about, "scene": script_json(scene), "source": source, "connect": connect}
-    return fill("viewer", decoder=web_source("nsvq.js"), **parts)
+    return fill(
+        "viewer",
+        title=escape(title.encode("utf-8", "replace").decode()),
+        about=about,
+        scene=script_json(scene),
+        source=source,
+        connect=connect,
+        decoder=web_source("nsvq.js"),
+    )
 
 
 def best_view(splats: SplatTensors, cameras: Sequence[Camera]) -> int:
@@ -106,13 +118,15 @@ def best_view(splats: SplatTensors, cameras: Sequence[Camera]) -> int:
     splats are looked at, evenly spaced.
     """
     step = -(-len(splats.means) // 50_000) or 1
-    means, weights = splats.means.detach()[::step], splats.opacities.detach()[::step].sigmoid()
+    means = splats.means.detach()[::step]
+    weights = splats.opacities.detach()[::step].sigmoid()
 
     def shown(camera: Camera) -> float:
         camera = camera.to("cpu", torch.float32)
         points = (means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T
-        edges = (2 * points[:, :2] / points[:, 2:] / torch.tensor([camera.width, camera.height]) - 1).abs()  # at 1
-        return float((weights * (1 - edges).clamp(min=0).prod(1))[points[:, 2] > camera.near].sum())
+        shares = points[:, :2] / points[:, 2:] / torch.tensor([camera.width, camera.height])
+        centrality = (1 - (2 * shares - 1).abs()).clamp(min=0).prod(1)
+        return float((weights * centrality)[points[:, 2] > camera.near].sum())
 
     return max(range(len(cameras)), key=lambda place: shown(cameras[place]))
 
@@ -147,11 +161,12 @@ def page_cameras(path: StrPath) -> dict[str, Camera]:
         scene: dict[str, Any] = json.loads(found[1]) if found else {"cameras": ()}
         near = float(scene.get("near", NEAR))
         for entry in scene["cameras"]:
-            name, width, height = str(entry["name"]), int(entry["width"]), int(entry["height"])
+            name = str(entry["name"])
             pose = torch.tensor(entry["camera_to_world"], dtype=torch.float64).view(4, 4)
             fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
             K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-            cameras[name] = Camera(K, (pose @ opengl).inverse().float(), width, height, near)
+            viewmat = (pose @ opengl).inverse().float()
+            cameras[name] = Camera(K, viewmat, int(entry["width"]), int(entry["height"]), near)
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"the cameras in {path} are damaged ({error}): name the photos with --data.root") from error
     return cameras
@@ -165,7 +180,8 @@ def web_source(name: str) -> str:
 def fill(page: str, **parts: str) -> str:
     """The page of this name, with its own style sheet and script, what all pages look like, and ``parts`` of it."""
     mark = web_source("mark.svg").strip()
-    parts["css"], parts["script"] = web_source("look.css") + web_source(f"{page}.css"), web_source(f"{page}.js")
+    parts["css"] = web_source("look.css") + web_source(f"{page}.css")
+    parts["script"] = web_source(f"{page}.js")
     parts["icon"] = data_address("svg+xml", mark.encode())
     parts["mark"] = mark.replace(' xmlns="http://www.w3.org/2000/svg"', "")  # HTML knows it
     return Template(web_source(f"{page}.html")).substitute(parts)

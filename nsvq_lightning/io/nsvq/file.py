@@ -114,15 +114,14 @@ def pack_fields(fields: Sequence[Integers], widths: Sequence[int]) -> bytes:
     Returns:
         ⌈N · Σ widths / 8⌉ bytes.
     """
-    chunks = []
+    packed = b""
     for start in range(0, len(fields[0]), _CHUNK):
-        number_bytes = (field[start : start + _CHUNK].astype("<u4").view(np.uint8).reshape(-1, 4) for field in fields)
-        columns = [
-            np.unpackbits(numbers, axis=1, count=width, bitorder="little")
-            for numbers, width in zip(number_bytes, widths, strict=True)
-        ]
-        chunks.append(np.packbits(np.concatenate(columns, axis=1), bitorder="little").tobytes())
-    return b"".join(chunks)
+        columns = []
+        for field, width in zip(fields, widths, strict=True):
+            number_bytes = field[start : start + _CHUNK, None].astype("<u4").view(np.uint8)
+            columns.append(np.unpackbits(number_bytes, axis=1, count=width, bitorder="little"))
+        packed += np.packbits(np.concatenate(columns, axis=1), bitorder="little").tobytes()
+    return packed
 
 
 def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) -> list[Uint32s]:
@@ -136,18 +135,18 @@ def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) ->
     Returns:
         One array ``[N]`` per field.
     """
-    packed, record = np.frombuffer(data, np.uint8), sum(widths)
+    packed = np.frombuffer(data, np.uint8)
+    record = sum(widths)
     fields = [np.zeros(rows, np.uint32) for _ in widths]
     for start in range(0, rows, _CHUNK):
         count = min(_CHUNK, rows - start)
-        chunk = packed[start * record // 8 : (start + _CHUNK) * record // 8]
-        bits = np.unpackbits(chunk, count=count * record, bitorder="little").reshape(count, record)
-        first = 0
-        for field, width in zip(fields, widths, strict=True):
+        chunk = packed[start * record // 8 :]
+        bits = np.unpackbits(chunk[: _CHUNK * record // 8], count=count * record, bitorder="little")
+        columns = np.split(bits.reshape(count, record), np.cumsum(widths)[:-1], axis=1)
+        for field, column in zip(fields, columns, strict=True):
             number = np.zeros((count, 32), np.uint8)
-            number[:, :width] = bits[:, first : first + width]
+            number[:, : column.shape[1]] = column
             field[start : start + count] = np.packbits(number, axis=1, bitorder="little").view("<u4")[:, 0]
-            first += width
     return fields
 
 
@@ -164,7 +163,7 @@ def paper_header(scene: CompressedScene) -> Header:
     """
     rows = {name: len(codebook) for name, codebook in scene.codebooks.items()}
     attributes = tuple(
-        AttributeEntry(name, dim, "codes", rows[name]) if name in rows else AttributeEntry(name, dim, "raw")
+        AttributeEntry(name, dim, "codes" if name in rows else "raw", rows.get(name, 0))
         for name, dim in _dims(scene.sh_degree).items()
     )
     return Header.of(scene, "paper", attributes, _layout(len(scene), attributes))
@@ -174,8 +173,7 @@ def encode_paper(scene: CompressedScene) -> tuple[Header, dict[str, bytes]]:
     """Header and streams of a scene at level ``paper``."""
     header = paper_header(scene)
     coded = [entry for entry in header.attributes if entry.storage == "codes"]
-    floats = {"means": scene.means, "opacities": scene.opacities}
-    floats |= {name: scene.values(name) for name in scene.raw}
+    floats = {name: scene.rows(name) for name in ("means", "opacities", *scene.raw)}
     floats |= {f"{name}.codebook": values for name, values in scene.codebooks.items()}
     streams = {name: values.astype("<f4", copy=False).tobytes() for name, values in floats.items()}
     if coded:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, naming_file
+from nsvq_lightning.io.errors import FormatError, Json, naming_file
 
 
 class AttributeEntry(NamedTuple):
@@ -87,7 +87,7 @@ class Header:
     origin: tuple[float, float, float]
     attributes: tuple[AttributeEntry, ...]
     streams: tuple[StreamEntry, ...]
-    config: dict[str, Any] = field(default_factory=dict)
+    config: Json = field(default_factory=dict)
     metrics: dict[str, float | None] = field(default_factory=dict)
 
     @classmethod
@@ -96,11 +96,11 @@ class Header:
     ) -> "Header":
         """Header of the file of a scene."""
         x, y, z = map(float, scene.origin)
-        told = dict(scene.config), dict(scene.metrics)
-        return cls(level, len(scene), scene.sh_degree, (x, y, z), entries, streams, *told)
+        config, metrics = dict(scene.config), dict(scene.metrics)
+        return cls(level, len(scene), scene.sh_degree, (x, y, z), entries, streams, config, metrics)
 
     @property
-    def of_scene(self) -> dict[str, Any]:
+    def of_scene(self) -> Json:
         """What a scene has from its header as it is."""
         return {name: getattr(self, name) for name in ("sh_degree", "config", "metrics", "origin")}
 
@@ -245,10 +245,11 @@ def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
     if version not in VERSIONS:
         known = " and ".join(map(str, VERSIONS))
         raise FormatError(f"version {version} of the format; this release reads {known}", "update nsvq-lightning")
-    payload = memoryview(data)[_PREFIX.size + json_bytes :]
-    if _PREFIX.size + json_bytes > len(data):
+    start = _PREFIX.size + json_bytes
+    if start > len(data):
         raise FormatError(f"damaged: a header of {json_bytes} bytes in a file of {len(data)}")
-    header = Header.from_json(data[_PREFIX.size : _PREFIX.size + json_bytes])
+    header = Header.from_json(data[_PREFIX.size : start])
+    payload = memoryview(data)[start:]
     streams: dict[str, memoryview] = {}
     end = 0
     for stream in header.streams:
@@ -270,7 +271,7 @@ def read_header(path: StrPath) -> Header:
     return read_frame(path)[0]
 
 
-def describe_nsvq(path: StrPath) -> dict[str, Any]:
+def describe_nsvq(path: StrPath) -> Json:
     """Facts about a file, as JSON values; errors are those of :func:`read_header`."""
     header, total = read_header(path), os.path.getsize(path)
     parts = [("header", "json", total - sum(stream.length for stream in header.streams))]
