@@ -356,7 +356,7 @@ def attribute_errors(read: CompressedScene, written: CompressedScene) -> dict[st
     others = unit(written.rows("quats"))
     nearer = np.minimum(np.linalg.norm(units - others, axis=1), np.linalg.norm(units + others, axis=1))
 
-    def difference(name: str) -> Float64s:
+    def difference(name: str) -> Arrays:
         return read.rows(name) - written.rows(name).astype(np.float64)
 
     errors = {

@@ -76,9 +76,10 @@ def read_ply_header(path: StrPath) -> PlyHeader:
     with naming_file(path), open(path, "rb") as file:
         header = _parsed(file)
         file_bytes = os.fstat(file.fileno()).st_size
-        # An ascii value takes at least one digit and one separator; the last separator may be missing.
-        row_bytes = 2 * len(header.properties) if header.encoding == "ascii" else header.dtype.itemsize
-        needed = header.offset + header.count * row_bytes - (header.encoding == "ascii" and header.count > 0)
+        needed = header.end
+        if header.encoding == "ascii" and header.count:
+            # A value takes at least one digit and one separator; the last separator may be missing.
+            needed = header.offset + header.count * 2 * len(header.properties) - 1
         if header.packed:
             needed = max(needed, *(header.others[name].end for name in ("chunk", "sh") if name in header.others))
         if needed > file_bytes:
@@ -191,11 +192,11 @@ def _end_of_lists(file: BinaryIO, offset: int, count: int, properties: list[tupl
 
 def splat_columns(sh_degree: int) -> dict[str, list[str]]:
     """Properties of each attribute; of the colours, all of red come first."""
-    stems = {name: attribute.ply for name, attribute in ATTRIBUTES.items()}
-    return {
-        name: [f"{stems[name]}{i}" for i in range(dim)] if stems[name].endswith("_") else stems[name].split()
-        for name, dim in attribute_dims(sh_degree).items()
-    }
+    columns = {}
+    for name, dim in attribute_dims(sh_degree).items():
+        stem = ATTRIBUTES[name].ply
+        columns[name] = [f"{stem}{i}" for i in range(dim)] if stem.endswith("_") else stem.split()
+    return columns
 
 
 def splat_degree(header: PlyHeader) -> int:
@@ -225,7 +226,8 @@ _RGB = ["red", "green", "blue"]
 
 def _needed(header: PlyHeader, sh_degree: int) -> dict[str, list[str]]:
     """Properties to read of each attribute: discs may have no third scale, splats colours in place of coefficients."""
-    columns, names = splat_columns(sh_degree), header.properties
+    columns = splat_columns(sh_degree)
+    names = header.properties
     if "scale_2" not in names:
         columns["scales"] = columns["scales"][:2]
     if columns["sh0"][0] not in names and set(_RGB) <= set(names):

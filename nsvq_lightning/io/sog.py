@@ -331,7 +331,7 @@ def _visibility(scene: CompressedScene) -> Float64s:
     Every splat counts a little, however small it is compared with the largest.
     """
     sizes = np.sort(scene.rows("scales"), axis=1)[:, 1:].mean(1).astype(np.float64)
-    weight = opacity_of(scene.opacities) * np.exp(sizes - sizes.max())
+    weight: Float64s = opacity_of(scene.opacities) * np.exp(sizes - sizes.max())
     return weight / float(weight.mean()) + 0.01
 
 
