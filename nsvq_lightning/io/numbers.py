@@ -3,6 +3,7 @@
 import logging
 import math
 import os
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -70,7 +71,7 @@ class Clamped:
     """Rounds and clamps values to a range; counts the splats outside it, by attribute."""
 
     def __init__(self) -> None:
-        self._counts: dict[str, int] = {}
+        self._counts = Counter[str]()
 
     def nearest(self, name: str, values: NDArray[np.floating], ends: tuple[int, int]) -> Int32s:
         """The nearest integers that the format has.
@@ -94,7 +95,7 @@ class Clamped:
 
     def _count(self, name: str, beyond: Bools) -> None:
         rows = beyond.any(tuple(range(1, beyond.ndim)))
-        self._counts[name] = self._counts.get(name, 0) + int(rows.sum())
+        self._counts[name] += int(rows.sum())
 
     def warn(self, path: StrPath, count: int) -> None:
         """Warn how many of ``count`` splats were clamped to the format's range."""

@@ -378,11 +378,11 @@ def _packed(scene: CompressedScene, name: str, factor: float | Float32s, zero: f
 
 def _packed_quats(rows: Float32s) -> Uint32s:
     largest, others = conventions.smallest_three(conventions.unit(rows)[:, [1, 2, 3, 0]])
-    packed = largest.astype(np.uint32)
+    packed = largest.astype("<u4")
     for part in others.T:
         magnitude = np.minimum(np.rint(511 * math.sqrt(2) * np.abs(part)), 511).astype(np.uint32)
-        packed = (packed << np.uint32(10)) | ((part < 0).astype(np.uint32) << np.uint32(9)) | magnitude
-    return packed.astype("<u4")
+        packed = packed << 10 | np.where(part < 0, np.uint32(512), np.uint32(0)) | magnitude
+    return packed
 
 
 def read_spz(path: StrPath) -> CompressedScene:
@@ -436,11 +436,11 @@ def _unpacked_means(header: SpzHeader, data: Uint8s) -> NDArray[np.floating[Any]
 
 def _unpacked_quats(header: SpzHeader, data: Uint8s) -> Float32s:
     if header.version < 3:
-        xyz = data.astype(np.float64) / 127.5 - 1
-        xyzw = conventions.from_smallest_three(np.full(header.count, 3), xyz)
+        largest = np.full(header.count, 3)
+        others = data / 127.5 - 1
     else:
-        packed = np.ascontiguousarray(data).view("<u4")[:, 0]
-        parts = np.stack([packed >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)], axis=1)
+        packed = np.ascontiguousarray(data).view("<u4")
+        parts = packed >> np.array([20, 10, 0], np.uint32) & 1023
+        largest = packed[:, 0] >> 30
         others = (parts & 511) / (511 * math.sqrt(2)) * np.where(parts & 512, -1, 1)
-        xyzw = conventions.from_smallest_three((packed >> np.uint32(30)).astype(np.intp), others)
-    return xyzw[:, [3, 0, 1, 2]]
+    return conventions.from_smallest_three(largest.astype(np.intp), others)[:, [3, 0, 1, 2]]

@@ -273,16 +273,19 @@ def read_header(path: StrPath) -> Header:
 
 def describe_nsvq(path: StrPath) -> Json:
     """Facts about a file, as JSON values; errors are those of :func:`read_header`."""
-    header, total = read_header(path), os.path.getsize(path)
-    parts = [("header", "json", total - sum(stream.length for stream in header.streams))]
-    parts += [(stream.name, stream.encoding, stream.length) for stream in header.streams]
+    header = read_header(path)
+    total = os.path.getsize(path)
+    start = StreamEntry("header", total - sum(stream.length for stream in header.streams), "json")
     return {
         "format": f"nsvq, level {header.level}",
         "splats": header.splats,
         "sh_degree": header.sh_degree,
         "origin": list(header.origin),
         "attributes": [{**entry._asdict(), "bits": entry.bits} for entry in header.attributes],
-        "streams": [{"name": name, "encoding": encoding, "bytes": size} for name, encoding, size in parts],
+        "streams": [
+            {"name": stream.name, "encoding": stream.encoding, "bytes": stream.length}
+            for stream in (start, *header.streams)
+        ],
         "bytes": total,
         "config": header.config,
         "metrics": header.metrics,
