@@ -11,12 +11,13 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+import numpy as np
 import torch
 
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import StrPath, write_text
 from nsvq_lightning.io.nsvq.file import read_nsvq
-from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.camera import Camera, camera_of
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.splats.splats import SplatTensors
@@ -131,6 +132,9 @@ def best_view(splats: SplatTensors, cameras: Sequence[Camera]) -> int:
     return max(range(len(cameras)), key=lambda place: shown(cameras[place]))
 
 
+_LENS = ("fx", "fy", "cx", "cy")
+
+
 def camera_entry(camera: Camera) -> dict[str, Any]:
     """A camera as the page's JSON has it.
 
@@ -138,12 +142,14 @@ def camera_entry(camera: Camera) -> dict[str, Any]:
         ``camera_to_world``, 16 numbers row by row, of a camera that looks along -z with y up, as in OpenGL and
         nerfstudio; ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy`` in pixels.
     """
-    packed = camera.packed_view
-    right, down, forward, position = packed[:3], packed[3:6], packed[6:9], packed[12:]
-    rows = [[right[k], -down[k], -forward[k], position[k]] for k in range(3)]
-    pose = [float(f"{value:.9g}") + 0.0 for row in [*rows, [0.0, 0.0, 0.0, 1.0]] for value in row]
-    intrinsics = dict(zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True))
-    return {"camera_to_world": pose, "width": camera.width, "height": camera.height, **intrinsics}
+    right, down, forward, _, position = np.reshape(camera.packed_view, (5, 3))
+    pose = [*np.stack([right, -down, -forward, position], axis=1).ravel(), 0.0, 0.0, 0.0, 1.0]
+    return {
+        "camera_to_world": [float(f"{value:.9g}") + 0.0 for value in pose],
+        "width": camera.width,
+        "height": camera.height,
+        **dict(zip(_LENS, camera.intrinsics, strict=True)),
+    }
 
 
 def page_cameras(path: StrPath) -> dict[str, Camera]:
@@ -163,10 +169,9 @@ def page_cameras(path: StrPath) -> dict[str, Camera]:
         for entry in scene["cameras"]:
             name = str(entry["name"])
             pose = torch.tensor(entry["camera_to_world"], dtype=torch.float64).view(4, 4)
-            fx, fy, cx, cy = (float(entry[key]) for key in ("fx", "fy", "cx", "cy"))
-            K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
             viewmat = (pose @ opengl).inverse().float()
-            cameras[name] = Camera(K, viewmat, int(entry["width"]), int(entry["height"]), near)
+            lens = tuple(entry[key] for key in _LENS)
+            cameras[name] = camera_of(viewmat, lens, int(entry["width"]), int(entry["height"]), near)
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"the cameras in {path} are damaged ({error}): name the photos with --data.root") from error
     return cameras
