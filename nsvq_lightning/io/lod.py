@@ -49,7 +49,8 @@ def write_lod(
     Raises:
         ValueError: A level is not coarser than the one before it.
     """
-    levels, target = [scene, *(level.finite() for level in coarser)], Path(path)
+    levels = [scene, *(level.finite() for level in coarser)]
+    target = Path(path)
     counts = [len(level) for level in levels]
     if any(a <= b for a, b in itertools.pairwise(counts)):
         raise ValueError(f"each level must have fewer splats than the one before it, got {counts}")
@@ -65,7 +66,7 @@ def write_lod(
             contents = sog_contents(splats.take(np.concatenate([rows for rows, _ in runs])), palette)
             # Those of two indices in one folder differ.
             digest = sha256(b"".join(contents.values())).hexdigest()[:8]
-            folder = f"{target.name.removesuffix(NAME)}{number}_{part}_{digest}"
+            folder = f"{target.name[: -len(NAME)]}{number}_{part}_{digest}"
             (target.parent / folder).mkdir(exist_ok=True)
             for name, data in contents.items():
                 write_bytes(target.parent / folder / name, data)
@@ -143,7 +144,8 @@ def _boxes(scene: CompressedScene) -> Float64s:
 
     axes = Rotation.from_quat(unit(scene.rows("quats"))[:, [1, 2, 3, 0]]).as_matrix()
     lengths = np.exp(scene.rows("scales").astype(np.float64))
-    reach = _REACH * np.sqrt(np.square(axes * lengths[:, None, :]).sum(2))
+    half_axes = axes * lengths[:, None, :]
+    reach = _REACH * np.sqrt(np.square(half_axes).sum(2))
     return np.stack([scene.means - reach, scene.means + reach], axis=1)
 
 

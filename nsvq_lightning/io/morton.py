@@ -44,8 +44,9 @@ class Grid:
         step = power_below(max(float(np.quantile(widest, 0.001)), finest))
         # Cells up to a quarter of the grid lie on multiples of their own width, whichever scene it was made for.
         quarter = 1 << AXIS_BITS - 2
-        first = np.rint(((low + high) / 2 / step - 2 * quarter) / quarter)
-        return cls(step, tuple(int(cell) * quarter for cell in first))  # type: ignore[arg-type]
+        middle = (low + high) / 2 / step
+        x, y, z = np.rint((middle - 2 * quarter) / quarter).tolist()
+        return cls(step, (int(x) * quarter, int(y) * quarter, int(z) * quarter))
 
     def cells(self, means: Float32s) -> tuple[Int64s, Bools]:
         """Cell of each position ``[N, 3]``, 0 for those outside; and which ``[N]`` are inside."""
@@ -60,8 +61,9 @@ class Grid:
     def centers(self, cells: Int64s, depths: Int64s) -> Float32s:
         """Centre of the cell of ``depths [N]`` bits that holds each cell ``[N, 3]``, scene units."""
         shift = (AXIS_BITS - depths)[:, None]
-        middle = (cells >> shift << shift) + 0.5 * (np.int64(1) << shift) + np.array(self.base, np.float64)
-        return (middle * self.step).astype(np.float32)
+        corners = cells >> shift << shift
+        middles = corners + 0.5 * (np.int64(1) << shift) + np.array(self.base, np.float64)
+        return (middles * self.step).astype(np.float32)
 
 
 def morton_keys(cells: Int64s, depths: Int64s) -> Uint64s:

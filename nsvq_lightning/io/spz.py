@@ -47,7 +47,7 @@ from nsvq_lightning.io.errors import FormatError, check_room, naming_file, wrong
 from nsvq_lightning.io.numbers import Clamped, bytes_of, logits_of_bytes
 from nsvq_lightning.io.placing import UP_AXES, rotated
 from nsvq_lightning.splats import conventions
-from nsvq_lightning.splats.attributes import attribute_dims
+from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
 from nsvq_lightning.splats.conventions import Arrays, Float32s, Uint8s, Uint32s
 
 logger = logging.getLogger(__name__)
@@ -290,7 +290,7 @@ def in_spz_order(scene: CompressedScene) -> CompressedScene:
     The codes of the spherical harmonics come first: in both versions, equal rows compress best when close together.
     """
     scene = scene.in_morton_order()
-    codes = [scene.codes[name] for name in ("quats", "scales", "sh0", "shN") if name in scene.codes]  # shN sorts first
+    codes = [scene.codes[name] for name in QUANTIZABLE if name in scene.codes]  # shN, the last, sorts first
     return scene.take(np.lexsort([np.arange(len(scene)), *codes]))
 
 

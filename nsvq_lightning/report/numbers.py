@@ -122,7 +122,8 @@ def _codes_in_use(codes: Integers, size: int) -> dict[str, Any]:
     """Rows of the codebook, how many of them are used, and the entropy of the codes, bits each."""
     counts = np.bincount(codes, minlength=size)
     shares = counts[counts > 0] / max(1, len(codes))
-    return {"codebook": size, "used": len(shares), "entropy": float(-(shares * np.log2(shares)).sum()) + 0.0}
+    entropy = float(-(shares * np.log2(shares)).sum()) + 0.0
+    return {"codebook": size, "used": len(shares), "entropy": entropy}
 
 
 def write_csv(path: Path, rows: Rows) -> None:

@@ -312,7 +312,8 @@ def _write_keys(keys, depths, words, contexts):  # type: ignore[no-untyped-def]
         start = _key_context(depths[i], before)
         low, width, used = _write_length(length, start, contexts, low, width, words, used)
         low, width, used = rc.encode_plain(_below(step, length), length - 1, low, width, words, used)
-        last, before = keys[i], (length + np.int64(shift) if length else 0)
+        last = keys[i]
+        before = length + np.int64(shift) if length else 0
     return rc.encode_end(low, words, used)
 
 

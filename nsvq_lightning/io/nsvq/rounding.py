@@ -96,7 +96,8 @@ def _integers(name: str, rows: Float32s, step: float, limit: float = 2.0**52) ->
     """The rows ``[N, D]`` as multiples of a step; quaternions are normalised first, unless they are multiples of it."""
     values = np.rint(rows.astype(np.float64) / step)
     if name == "quats" and not np.array_equal((values * step).astype(np.float32), rows):
-        values = np.rint(unit(rows).astype(np.float32).astype(np.float64) / step)
+        units = unit(rows).astype(np.float32)
+        values = np.rint(units.astype(np.float64) / step)
     if not (np.abs(values) < limit).all():
         raise ValueError(f"{name}: {np.abs(rows).max():.3g} is too large for steps of {step:.3g}; use level 'paper'")
     return values.astype(np.int64)
@@ -167,11 +168,13 @@ def tree_order(codebook: Float32s) -> Int64s:
 def leaf_paths(count: int) -> Int64s:
     """Path ``[count]`` of each leaf, ascending: the halves taken from the root, ⌈log2 count⌉ bits, 0 after the leaf."""
     low, high = np.zeros(count, np.int64), np.full(count, count, np.int64)
-    paths, leaves = np.zeros(count, np.int64), np.arange(count)
+    paths = np.zeros(count, np.int64)
+    leaves = np.arange(count)
     for _ in range((count - 1).bit_length()):
         cut = low + (high - low + 1) // 2
         right = (leaves >= cut) & (high - low > 1)
-        low, high = np.where(right, cut, low), np.where(right, high, np.minimum(cut, high))
+        low = np.where(right, cut, low)
+        high = np.where(right, high, np.minimum(cut, high))
         paths = 2 * paths + right
     return paths
 
@@ -183,7 +186,8 @@ def sibling_distance(ordered: Float32s) -> float:
     dense, and so how exactly they must be stored.
     """
     differences = np.diff(ordered.astype(np.float64), axis=0)[::2]
-    return float(np.median(np.sqrt((differences**2).mean(1)))) if differences.size else 0.0
+    distances = np.sqrt((differences**2).mean(1))
+    return float(np.median(distances)) if differences.size else 0.0
 
 
 # Power-iteration steps for the direction of a cut. It need not be exact: 12 would save another 0.02 % of a file.
@@ -195,8 +199,11 @@ def _cut(rows, order):  # type: ignore[no-untyped-def]
     # Plain loops: every expression of whole arrays would be a kernel of its own, compiled for a second.
     dim = rows.shape[1]
     starts, ends = np.empty(128, np.int64), np.empty(128, np.int64)
-    starts[0], ends[0], waiting = 0, len(rows), 1
-    center, direction, product = np.empty(dim), np.empty(dim), np.empty(dim)
+    starts[0], ends[0] = 0, len(rows)
+    waiting = 1
+    center = np.empty(dim)
+    direction = np.empty(dim)
+    product = np.empty(dim)
     while waiting > 0:
         waiting -= 1
         start, end = starts[waiting], ends[waiting]
