@@ -35,6 +35,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -140,17 +141,7 @@ def _write_frame(path: StrPath, header: SpzHeader, arrays: Mapping[str, Arrays])
 
 
 def _unpack(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
-    """Header and arrays of version 4."""
-    header, lengths = _table(data)
-    start, contents = len(data) - sum(lengths.values()), {}
-    for name, length in lengths.items():
-        contents[name] = zstd_decompress(memoryview(data)[start : start + length], header.streams[name])
-        start += length
-    return header, contents
-
-
-def _table(data: bytes) -> tuple[SpzHeader, dict[str, int]]:
-    """Header of version 4, and the compressed bytes of each stream; the streams fill the rest of the file."""
+    """Header and arrays of version 4; the streams fill the rest of the file."""
     header = _parse(data[: _HEADER.size], len(data))
     if header.version < 4 or len(data) < _HEAD:
         raise FormatError(f"truncated or damaged: version {header.version} in {len(data)} bytes without gzip")
@@ -161,16 +152,20 @@ def _table(data: bytes) -> tuple[SpzHeader, dict[str, int]]:
     start = offset + _ENTRY.size * streams
     if not _HEAD <= offset <= start <= len(data):
         raise FormatError(f"truncated or damaged: a table of {streams} streams at {offset}, of {len(data)} bytes")
-    lengths = {}
+    ends = [start]
     entries = zip(header.streams.items(), _ENTRY.iter_unpack(data[offset:start]), strict=True)
     for (name, expected), (length, size) in entries:
         # One byte of Zstandard expands to 32 KiB at most: a block of 128 KiB of equal bytes takes four.
         if size != expected or size > length << 15:
             raise FormatError(f"damaged: {name} of {header.count} splats cannot be {size} bytes in {length}")
-        lengths[name] = length
-    if start + sum(lengths.values()) != len(data):
-        raise FormatError(f"truncated or damaged: streams of {sum(lengths.values())} bytes in {len(data) - start}")
-    return _with_axes(header, data[_HEAD:offset]), lengths
+        ends.append(ends[-1] + length)
+    if ends[-1] != len(data):
+        raise FormatError(f"truncated or damaged: streams of {ends[-1] - start} bytes in {len(data) - start}")
+    header = _with_axes(header, data[_HEAD:offset])
+    contents = {}
+    for (name, size), (first, end) in zip(header.streams.items(), pairwise(ends), strict=True):
+        contents[name] = zstd_decompress(memoryview(data)[first:end], size)
+    return header, contents
 
 
 def zstd_compress(data: memoryview) -> bytes:

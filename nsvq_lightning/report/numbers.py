@@ -83,7 +83,8 @@ def summarize(
         paper: :func:`paper_level` of the scene that was stored.
     """
     scored = "psnr", "ssim", "cc_psnr", "cc_ssim"
-    file_bytes, header = path.stat().st_size, read_header(path)
+    file_bytes = path.stat().st_size
+    header = read_header(path)
     plain_bytes = plain_ply_bytes(len(scene), scene.sh_degree)
     last = {str(entry["phase"]): dict(entry) for entry in module.history}  # the last evaluation of each phase
     ends = [last[phase.name.lower()] for phase in Phase if phase.name.lower() in last]

@@ -78,7 +78,8 @@ def as_bytes(image: Tensor) -> Uint8s:
 
 def write_png(path: Path, image: Tensor) -> None:
     """Write an RGB image ``[H, W, 3]`` in [0, 1] as 8-bit PNG, atomically."""
-    write_bytes(path, cv2.imencode(".png", cv2.cvtColor(as_bytes(image), cv2.COLOR_RGB2BGR))[1].tobytes())
+    bgr = cv2.cvtColor(as_bytes(image), cv2.COLOR_RGB2BGR)
+    write_bytes(path, cv2.imencode(".png", bgr)[1].tobytes())
 
 
 def log_pictures(loggers: Sequence[Logger], pictures: Sequence[Path], step: int) -> None:
@@ -127,7 +128,8 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
         file = Path(folder) / f"video{VIDEO}"
         first = file.with_suffix(".avi") if program else file  # from which ffmpeg makes the other
         code = "FFV1" if program else "vp09"
-        video = cv2.VideoWriter(str(first), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*code), fps, (width, height))
+        fourcc = cv2.VideoWriter.fourcc(*code)
+        video = cv2.VideoWriter(str(first), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
         if not video.isOpened():
             raise OSError(f"OpenCV cannot write {code} here: write PNGs into a folder")
         try:

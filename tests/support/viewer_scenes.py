@@ -68,9 +68,9 @@ def sigmoid(logits: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def read_spz_header(path: Path) -> spz.SpzHeader:
-    """Header of any version; needs no Zstandard."""
+    """Header of any version."""
     data = path.read_bytes()
-    return spz._table(data)[0] if data.startswith(b"NGSP") else spz._unzip(data)[0]
+    return spz._unpack(data)[0] if data.startswith(b"NGSP") else spz._unzip(data)[0]
 
 
 def read_table(path: Path) -> SimpleNamespace:
