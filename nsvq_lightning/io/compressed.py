@@ -154,7 +154,7 @@ class CompressedScene:
                 codebooks[name] = np.concatenate(books)
             else:
                 raw[name] = np.concatenate([scene.rows(name) for scene in scenes])
-        means = [scene.means + (np.array(scene.origin) - np.array(first.origin)) for scene in scenes]
+        means = [scene.means + np.subtract(scene.origin, first.origin) for scene in scenes]
         return cls(
             np.concatenate(means).astype(np.float32),
             np.concatenate([scene.opacities for scene in scenes]),
@@ -241,7 +241,8 @@ class CompressedScene:
             high: Largest ``[3]``.
         """
         positions = self.means.astype(np.float64) + np.array(self.origin)
-        return self.take(((positions >= low) & (positions <= high)).all(1))
+        inside = (positions >= low) & (positions <= high)
+        return self.take(inside.all(1))
 
     def finite_rows(self) -> tuple[Bools, dict[str, int]]:
         """Which splats ``[N]`` have neither NaN nor infinite values, and how many do, by attribute."""

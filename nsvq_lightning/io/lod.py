@@ -121,10 +121,13 @@ def _tree(levels: Sequence[CompressedScene]) -> tuple[Json, list[tuple[list[Inte
         middle = np.median(means[finest, axis])
         below = means[splats, axis] < middle
         if len(finest) > LEAF and below[: len(finest)].any():
-            return found | {"children": [node(splats[below]), node(splats[~below])]}
+            found["children"] = [node(splats[below]), node(splats[~below])]
+            return found
         found["lods"] = {}
-        rows = [each[spatial_order(means[each])] for each in (finest, *coarser)]
-        leaves.append(([each - start for each, start in zip(rows, starts, strict=False)], found))
+        rows = []
+        for each, start in zip((finest, *coarser), starts, strict=False):
+            rows.append(each[spatial_order(means[each])] - start)
+        leaves.append((rows, found))
         return found
 
     return node(np.arange(len(means))), leaves

@@ -85,8 +85,8 @@ def find_palette(rows: Float32s, weight: NDArray[np.number[Any]], count: int) ->
     for number, (start, end) in enumerate(_cells(best_cut, len(rows), count)):
         labels[order[start:end]] = number
     mass = np.bincount(labels, wide)
-    sums = (np.bincount(labels, wide * column) for column in rows.T)
-    return np.stack([total / mass for total in sums], axis=1).astype(np.float32), labels
+    means = [np.bincount(labels, wide * column) / mass for column in rows.T]
+    return np.stack(means, axis=1).astype(np.float32), labels
 
 
 @kernel

@@ -422,7 +422,8 @@ def write_ply(path: StrPath, scene: CompressedScene) -> int:
             columns = {name: scene.rows(name, slice(start, start + _ROWS)) for name in ATTRIBUTES}
             columns["shN"] = _by_color(columns["shN"])
             columns["unused"] = np.zeros((len(columns["means"]), len(_UNUSED)), np.float32)
-            file.write(np.concatenate([columns[name] for name in _ORDER], axis=1).astype("<f4", copy=False).tobytes())
+            table = np.concatenate([columns[name] for name in _ORDER], axis=1)
+            file.write(table.astype("<f4", copy=False).tobytes())
         return file.tell()
 
 

@@ -282,8 +282,9 @@ class _Archive:
         mins, maxs = (self._numbers("means", name, range(3, 4), math.log1p(_LARGEST)) for name in ("mins", "maxs"))
         low, high = (self.texels("means", number)[:, :3] for number in range(2))
         logs = mins + (maxs - mins) * ((low + 256.0 * high) / 65535)
+        means = np.copysign(np.expm1(np.abs(logs)), logs)
         # The logarithm of the largest float32 may round up, beyond it.
-        return np.clip(np.copysign(np.expm1(np.abs(logs)), logs), -3.4e38, 3.4e38).astype(np.float32)
+        return means.clip(-3.4e38, 3.4e38).astype(np.float32)
 
     def quats(self) -> Float32s:
         """Rotations ``[N, 4]``; NaN where the mark is none."""
