@@ -114,14 +114,14 @@ def pack_fields(fields: Sequence[Integers], widths: Sequence[int]) -> bytes:
     Returns:
         ⌈N · Σ widths / 8⌉ bytes.
     """
-    packed = b""
+    chunks = []
     for start in range(0, len(fields[0]), _CHUNK):
         columns = []
         for field, width in zip(fields, widths, strict=True):
             number_bytes = field[start : start + _CHUNK, None].astype("<u4").view(np.uint8)
             columns.append(np.unpackbits(number_bytes, axis=1, count=width, bitorder="little"))
-        packed += np.packbits(np.concatenate(columns, axis=1), bitorder="little").tobytes()
-    return packed
+        chunks.append(np.packbits(np.concatenate(columns, axis=1), bitorder="little").tobytes())
+    return b"".join(chunks)
 
 
 def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) -> list[Uint32s]:
