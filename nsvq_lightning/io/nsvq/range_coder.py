@@ -29,7 +29,7 @@ def _chance(context, contexts):
 
 _RATES = np.rint(65536 / (np.arange(COUNT_LIMIT + 1) + 1.6)).astype(np.int64)
 # No probability is below 48/65536: an unlikely bit costs at most 11 bits.
-_LEAST = 48
+_MIN_CHANCE = 48
 
 
 @inline
@@ -37,7 +37,7 @@ def _learn(bit, context, contexts):
     """Move the probability towards the bit; without branches, which would be unpredictable."""
     n = np.int64(contexts[context] & uint32(255))
     chance = np.int64(contexts[context] >> uint32(8))
-    target = _LEAST + np.int64(bit) * (65536 - 2 * _LEAST)
+    target = _MIN_CHANCE + np.int64(bit) * (65536 - 2 * _MIN_CHANCE)
     chance += ((target - chance) * _RATES[n]) >> 16
     contexts[context] = uint32((chance << 8) + n + (n < COUNT_LIMIT))
 
