@@ -4,8 +4,8 @@ import logging
 import math
 import timeit
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property, partial
 
 import torch
 from torch import Tensor
@@ -53,30 +53,37 @@ class Candidate:
 
 
 # Shares of the trained splats that are stored: those that are missed least go where a file is too large.
-KEPT = 1.0, 0.97
-# Most views in which contributions are measured.
-MOST_VIEWS = 96
-# A file may be this much smaller than it is to be; so many estimates of what to store in it are tried.
-SLACK, ESTIMATES = 0.01, 5
-# Steps of a training, and how many times as many where fewer splats than this share take time to cover what all did.
-FEWEST_STEPS, USUAL_STEPS, THINNING, THINNED = 20, 500, 3, 0.97
+KEPT = (1.0, 0.97)
+# Of views in which contributions are measured.
+MAX_VIEWS = 96
+# A file may be smaller by this share than it is to be.
+SLACK = 0.01
+# How many estimates of what to store in a file are tried.
+ESTIMATES = 5
+# Steps of a training.
+MIN_STEPS = 20
+USUAL_STEPS = 500
+# Where fewer splats than this share are left, and so many times as many steps: they have to cover what all did.
+THINNED = 0.97
+THINNING = 3
 
 
 def _turned(setting: Setting, turn: float) -> Setting:
     """The setting with its step, or else its share of splats, from the most exact at 0 to the smallest at 1."""
-    name, (low, high) = ("step", STEPS) if setting.step else ("kept", KEPT)
-    return replace(setting, **{name: low * (high / low) ** turn})
+    if setting.step:
+        exact, small = STEPS
+        return replace(setting, step=exact * (small / exact) ** turn)
+    exact, small = KEPT
+    return replace(setting, kept=exact * (small / exact) ** turn)
 
 
+@dataclass(eq=False)
 class Compressor:
     """Compresses one scene at any setting; each pair of codebooks and number of splats is trained at most once.
 
     Small files have codebooks; in larger ones, spherical harmonics, which lose most by that, are on a basis.
 
     Attributes:
-        stopped: Whether Ctrl-C has ended a training before its end.
-
-    Args:
         scene: The scene, finite.
         data: Views to train on.
         measure: Measures errors.
@@ -85,57 +92,57 @@ class Compressor:
         minutes: What one training may take, about.
         steps: Steps of a training, at least 4; None as many as the minutes allow, at most :data:`USUAL_STEPS`, or
             :data:`THINNING` times as many.
+        stopped: Whether Ctrl-C has ended a training before its end.
     """
 
-    def __init__(
-        self,
-        scene: CompressedScene,
-        data: SceneDataModule,
-        measure: Measure,
-        storage: Storage,
-        seed: int = 0,
-        minutes: float = math.inf,
-        steps: int | None = None,
-    ) -> None:
-        self._scene, self._data, self._measure, self._storage, self._seed = scene, data, measure, storage, seed
-        self._splats = detached(scene.decode())
-        self._render = partial(render, antialiased=scene.antialiased)
-        self._steps, self._minutes = steps, minutes
-        self._trained: dict[Setting, tuple[CompressedScene, Tensor]] = {}
-        self._effects: dict[Setting, Tensor] = {}
-        self.stopped = False
+    scene: CompressedScene
+    data: SceneDataModule
+    measure: Measure
+    storage: Storage
+    seed: int = 0
+    minutes: float = math.inf
+    steps: int | None = None
+    stopped: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        self._splats = detached(self.scene.decode())
+        self._render = partial(render, antialiased=self.scene.antialiased)
+        views = self.data.scene
+        self._views = [(index, views.cameras[index]) for index in views.some_train(MAX_VIEWS)]
+        # Of settings without steps and shares, which need no training of their own.
+        self._trained = cache(self._train)
+        self._weights = cache(self._row_weights)
+        self._effects = cache(self._likely_effects)
 
     def at(self, setting: Setting) -> Candidate:
         """The scene at a setting."""
-        key = replace(setting, step=0.0, kept=1.0)
-        if key not in self._trained:
-            scene = self._train(setting)
-            cameras = [self._data.scene.cameras[index] for index in self._data.scene.some_train(MOST_VIEWS)]
-            weights = row_weights(contributions(scene.decode(), cameras, self._render)).sqrt()
-            self._trained[key] = scene, weights
-        scene, weights = self._trained[key]
+        whole = replace(setting, step=0.0, kept=1.0)
+        scene = self._trained(whole)
         if setting.step:
-            rows, basis = components(torch.from_numpy(scene.raw["shN"]), weights, setting.step)
+            rows, basis = components(torch.from_numpy(scene.raw["shN"]), self._weights(whole), setting.step)
             scene = replace(scene, raw={**scene.raw, "shN": rows}, bases={"shN": basis})
         if setting.kept < 1:
-            if key not in self._effects:
-                self._effects[key] = self._likely_effects(scene)
-            kept = most_contributing(self._effects[key], math.ceil(setting.kept * len(scene)))
+            kept = most_contributing(self._effects(whole), math.ceil(setting.kept * len(scene)))
             scene = scene.take(kept.numpy()).in_use()
-        return Candidate(setting, b"".join(frame(*encode(scene, self._storage))))
+        return Candidate(setting, b"".join(frame(*encode(scene, self.storage))))
 
-    def _likely_effects(self, scene: CompressedScene) -> Tensor:
+    def _row_weights(self, setting: Setting) -> Tensor:
+        """How much each splat counts where harmonics are put on a basis ``[N]``."""
+        cameras = [camera for _, camera in self._views]
+        return row_weights(contributions(self._trained(setting).decode(), cameras, self._render)).sqrt()
+
+    def _likely_effects(self, setting: Setting) -> Tensor:
         """How much pictures are likely to change without each splat ``[N]``."""
-        splats, views = below_cap(scene.decode()), self._data.scene
+        splats = below_cap(self._trained(setting).decode())
         squares = torch.zeros_like(splats.opacities)
-        for index in views.some_train(MOST_VIEWS):
-            signs = generator(self._seed, 0, "signs", index)
-            squares += sensitivity(splats, views.cameras[index], self._render, signs)[0].opacities
+        for index, camera in self._views:
+            signs = generator(self.seed, 0, "signs", index)
+            squares += sensitivity(splats, camera, self._render, signs)[0].opacities
         return likely_effects(splats, squares)
 
     def error(self, candidate: Candidate) -> float:
         """Root mean square difference between its pictures and those of the original, for channels in [0, 1]."""
-        return self._measure.error(candidate.scene.decode())
+        return self.measure.error(candidate.scene.decode())
 
     def finest_within(self, target: int, splats: int) -> Candidate:
         """The best file of at most ``target`` bytes and this many splats.
@@ -144,18 +151,25 @@ class Compressor:
             ValueError: None was found.
         """
         best: Candidate | None = None
-        asked, near = float(target), (1 - SLACK) * target
+        asked = float(target)
         for _ in range(ESTIMATES):
-            setting = setting_for(int(asked), splats, self._scene.sh_degree)
-            if setting.codebooks == "none" and len((exact := self.at(replace(setting, step=0.0))).data) <= target:
-                return exact
-            found = self._between(setting, True, lambda each: len(each.data) <= target, lambda size: size >= near)
+            setting = setting_for(int(asked), splats, self.scene.sh_degree)
+            if setting.codebooks == "none":
+                exact = self.at(replace(setting, step=0.0))
+                if len(exact.data) <= target:
+                    return exact
+            found = self._between(
+                setting,
+                lambda each: len(each.data) <= target,
+                is_close=lambda size: size >= (1 - SLACK) * target,
+            )
             if found and (best is None or len(found.data) > len(best.data)):
                 best = found
             if self.stopped or (found and (setting.step or len(found.data) >= (1 - 2 * SLACK) * target)):
                 break
             # What the estimate made of its bytes.
-            asked *= (1 - SLACK / 2) * target / len((found or self.at(_turned(setting, 1.0))).data)
+            made = found or self.at(_turned(setting, 1.0))
+            asked *= (1 - SLACK / 2) * target / len(made.data)
         if best is None:
             raise ValueError(f"found no file of {target} bytes: allow more {'time' if self.stopped else 'bytes'}")
         return best
@@ -170,15 +184,20 @@ class Compressor:
         def fits(candidate: Candidate) -> bool:
             return self.error(candidate) <= error
 
-        plain, settings = self.at(Setting(splats, "none")), [Setting(splats, name) for name in SIZES]
-        if self._scene.sh_degree:
+        plain = self.at(Setting(splats, "none"))
+        found = [plain] if fits(plain) else []
+        settings = [Setting(splats, name) for name in SIZES]
+        if self.scene.sh_degree:
             settings.insert(0, Setting(splats, "none", STEPS[0]))
-        found, first, end = [plain] if fits(plain) else [], -1, len(settings)
+        first, end = -1, len(settings)  # the last one with a file that fits, and the first one without
         while end - first > 1 and not self.stopped:
             middle = (first + end) // 2
-            candidate = self._between(settings[middle], False, fits, lambda _: False)
-            first, end = (first, middle) if candidate is None else (middle, end)
-            found += [] if candidate is None else [candidate]
+            candidate = self._between(settings[middle], fits, small=False)
+            if candidate is None:
+                end = middle
+            else:
+                first = middle
+                found.append(candidate)
         if not found:
             raise ValueError(
                 f"no setting has an error of at most {error:g}: the most exact one has {self.error(plain):.3g} in "
@@ -187,17 +206,21 @@ class Compressor:
         return min(found, key=lambda each: len(each.data))
 
     def _between(
-        self, setting: Setting, small: bool, fits: Callable[[Candidate], bool], is_close: Callable[[int], bool]
+        self,
+        setting: Setting,
+        fits: Callable[[Candidate], bool],
+        is_close: Callable[[int], bool] = lambda _: False,
+        small: bool = True,
     ) -> Candidate | None:
         """The candidate nearest to the most exact one, or with ``small`` False to the smallest, that fits; or None."""
         good, bad = (1.0, 0.0) if small else (0.0, 1.0)
-        for turn in (bad, good):
-            best = self.at(_turned(setting, turn))
-            if fits(best):
-                break
-        else:
+        best = self.at(_turned(setting, bad))
+        if fits(best):
+            return best
+        best = self.at(_turned(setting, good))
+        if not fits(best):
             return None
-        while turn != bad and abs(good - bad) > 0.02 and not is_close(len(best.data)):
+        while abs(good - bad) > 0.02 and not is_close(len(best.data)):
             middle = (good + bad) / 2
             candidate = self.at(_turned(setting, middle))
             if fits(candidate):
@@ -211,48 +234,66 @@ class Compressor:
         sizes = {} if setting.codebooks == "none" else dict(codebook_sizes(setting.codebooks))
         if "shN" in sizes:
             sizes["shN"] += setting.more
-        steps = max(4, self._steps or self.usual_steps(setting.splats))
-        prune = steps // 4 if setting.splats < len(self._scene) else 0
-        quantize = prune + 2 * (steps - prune) // 3 if sizes else steps
-        phases = {"warmup_end": 0, "prune_end": prune, "quantize_end": quantize, "position_decay": max(1, prune)}
+        steps = max(4, self.steps or self.usual_steps(setting.splats))
+        prune = steps // 4 if setting.splats < len(self.scene) else 0
         module = SplatModule(
             splats=Splats.from_tensors(*(tensor.clone() for tensor in self._splats)),
             codebooks=sizes or None,
             # A trained scene is in its place; what is left of some splats moves into that of the others.
             rates=LearningRates(means=4e-5 if prune else LearningRates.means_final),
-            antialiased=self._scene.antialiased,
-            seed=self._seed,
-            storage=self._storage,
+            antialiased=self.scene.antialiased,
+            seed=self.seed,
+            storage=self.storage,
         )
         if sizes or prune:
-            names = "density", "sh_degree", "codebook_replacement", "report", "live", "export", "predictions"
+            phases = PhaseSchedule(
+                total=steps,
+                reference_total=None,
+                min_finetune=1,
+                warmup_end=0,
+                prune_end=prune,
+                quantize_end=prune + 2 * (steps - prune) // 3 if sizes else steps,
+                position_decay=max(1, prune),
+            )
             callbacks = standard(
-                phases=PhaseSchedule(total=steps, reference_total=None, min_finetune=1, **phases),
+                phases=phases,
                 budget=SplatBudget(splats=setting.splats),
                 rate_decay=LearningRateDecay(start=prune),
-                **dict.fromkeys((*names, "checkpoint")),
+                density=None,
+                sh_degree=None,
+                codebook_replacement=None,
+                report=None,
+                live=None,
+                export=None,
+                predictions=None,
+                checkpoint=None,
             )
-            chatter = logging.getLogger("lightning.pytorch")
-            level = chatter.level
-            chatter.setLevel(logging.WARNING)
-            trainer = SplatTrainer(max_steps=steps, callbacks=callbacks, enable_checkpointing=False)
-            try:
-                trainer.fit(module, self._data)
-            except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
-                if module.phase < Phase.QUANTIZE:
-                    raise
-                self.stopped = True
-            finally:
-                chatter.setLevel(level)
-        found = replace(module.compressed().finite(), origin=self._scene.origin)
+            self._fit(module, SplatTrainer(max_steps=steps, callbacks=callbacks, enable_checkpointing=False))
+        found = replace(module.compressed().finite(), origin=self.scene.origin)
         del module
         trim()
         return found
 
+    def _fit(self, module: SplatModule, trainer: SplatTrainer) -> None:
+        """Train without Lightning's messages; Ctrl-C ends it early once there are codes."""
+        chatter = logging.getLogger("lightning.pytorch")
+        level = chatter.level
+        chatter.setLevel(logging.WARNING)
+        try:
+            trainer.fit(module, self.data)
+        except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
+            if module.phase < Phase.QUANTIZE:
+                raise
+            self.stopped = True
+        finally:
+            chatter.setLevel(level)
+
     def usual_steps(self, splats: int) -> int:
         """How many steps a training of this many of the splats takes."""
-        usual = USUAL_STEPS * (THINNING if splats < THINNED * len(self._scene) else 1)
-        return max(FEWEST_STEPS, min(self._affordable, usual))
+        usual = USUAL_STEPS
+        if splats < THINNED * len(self.scene):
+            usual *= THINNING
+        return max(MIN_STEPS, min(self._affordable, usual))
 
     @cached_property
     def _affordable(self) -> int:
@@ -261,7 +302,8 @@ class Compressor:
         leaves = type(self._splats)(*(tensor.to(device).clone().requires_grad_() for tensor in self._splats))
 
         def step() -> None:
-            self._render(leaves, self._measure.cameras[0]).image.sum().backward()  # type: ignore[no-untyped-call]
+            self._render(leaves, self.measure.cameras[0]).image.sum().backward()  # type: ignore[no-untyped-call]
             torch.get_device_module(device).synchronize()
 
-        return int(min(60 * self._minutes / (2 * min(timeit.repeat(step, number=1, repeat=3))), 1e9))
+        seconds = 2 * min(timeit.repeat(step, number=1, repeat=3))
+        return int(min(60 * self.minutes / seconds, 1e9))
