@@ -161,7 +161,7 @@ def test_checkout_runs_without_links(without_links: Path) -> None:
     lines = [
         "import importlib.util, os, pickle",
         "from nsvq_lightning.callbacks.density import DensityControl",
-        "from nsvq_lightning.commands.arguments import find_config",
+        "from nsvq_lightning.commands.settings import find_config",
         "assert pickle.loads(pickle.dumps(DensityControl)) is DensityControl",
         "assert DensityControl.__module__ == 'nsvq_lightning.callbacks.density'",
         "assert os.path.samefile(find_config('demo'), 'configs/demo.yaml')",

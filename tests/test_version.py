@@ -16,7 +16,7 @@ from nsvq_lightning.version import check_replaced
 @pytest.mark.parametrize(
     ("owner", "name", "module"),
     [
-        (jsonargparse._typehints, "discard_init_args_on_class_path_change", "nsvq_lightning.commands.fit"),
+        (jsonargparse._typehints, "discard_init_args_on_class_path_change", "nsvq_lightning.commands.parser"),
         (LightningCLI, "_parse_ckpt_path", "nsvq_lightning.commands.fit"),
         (LightningCLI, "_set_seed", "nsvq_lightning.commands.fit"),
         (DDPStrategy, "configure_ddp", "nsvq_lightning.training.distributed"),

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from nsvq_lightning.commands import arguments as given
+from nsvq_lightning.commands import settings as given
 
 # Each check imports what it needs: --help answers at once, and a package that is missing or broken fails only the
 # checks that need it.

@@ -1,31 +1,24 @@
 """LightningCLI with this package's module, data, callbacks and defaults, and its help."""
 
-import inspect
 import json
 import math
 import os
-import re
 import shlex
-import shutil
 import sys
-import textwrap
-from argparse import SUPPRESS
-from collections.abc import Iterable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from pkgutil import resolve_name
-from typing import Any, ClassVar, NamedTuple, NoReturn
+from typing import Any
 
-from jsonargparse import Namespace, set_parsing_settings
-from jsonargparse import _typehints as typehints
+from jsonargparse import set_parsing_settings
 from lightning.pytorch import Callback, LightningModule, Trainer, loggers
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 
-from nsvq_lightning import callbacks, quantize
+from nsvq_lightning.callbacks import RunCheckpoint
 from nsvq_lightning.callbacks.standard import OPTIONAL, STANDARD
-from nsvq_lightning.commands import arguments as given
-from nsvq_lightning.commands.registry import COMMANDS
+from nsvq_lightning.commands import COMMANDS, OF_LIGHTNING
+from nsvq_lightning.commands.parser import QuietParser, class_help, first_sentence
+from nsvq_lightning.commands.settings import configs_among, find_config, settings_of
 from nsvq_lightning.data.colmap import check_name
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.io.atomic import optional, write_text
@@ -37,54 +30,22 @@ from nsvq_lightning.training.trainer import TRAINER_DEFAULTS, SplatTrainer
 from nsvq_lightning.version import check_replaced
 
 
-class QuietParser(LightningArgumentParser):
-    """Reports errors without the usage, which has about a hundred lines, and lists options without their classes."""
+class RunLogger(loggers.CSVLogger):
+    """Lightning's, which a file that another program holds does not end the run."""
 
-    arguments: ClassVar[Sequence[str]] = ()
-    """The command line, and what its configs set, as options."""
-
-    def format_help(self, *args: Any) -> str:
-        """Help of a command, see :func:`command_help`."""
-        subcommand = self.prog.rpartition(" ")[2]
-        return command_help(self, subcommand) if subcommand in COMMANDS else super().format_help(*args)
-
-    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        """Write the message to stderr and exit with status 2."""
-        # Parsers of nested classes are made by jsonargparse and named after the script.
-        program = self.prog.replace(" [options]", "") if self.prog.startswith("nsvq") else "nsvq COMMAND"
-        if message.endswith("required: root"):
-            message += " (--data.root=path/to/scene)"
-        elif message.startswith('Parser key "data":') and Path(message.rpartition("Given value: ")[2]).is_dir():
-            message = "--data takes the name of a data module; the folder of a scene is --data.root=path/to/scene"
-        else:
-            message = given.in_plain_words(message, CLASSES, self.arguments)
-            parsers = getattr(self._subcommands_action, "_name_parser_map", {"": self}).values()
-            options = [option for parser in parsers for option in parser._option_string_actions]
-            message += given.unknown_option(message, options)
-        sys.stderr.write(f"error: {message}\nAll options: {program} --help\n")
-        self.exit(2)
+    def save(self) -> None:
+        """Write what has been logged; what cannot be written now is written later."""
+        with optional(self.log_dir):
+            super().save()
 
 
-# Names that options take as they are: short class names resolve to what is imported.
-CLASSES = (*callbacks.__all__, *quantize.__all__, "ColmapDataModule", "DemoDataModule")
-
-
-def _drop_settings_of_another_class(_: Any, before: Any, value: Any) -> None:
-    """Where an option names another class, keep only what was set for the one before that it is derived from.
-
-    jsonargparse keeps all settings of the same name: the paper's threshold would become one of BudgetedGrowth.
-    """
-    if before and "init_args" in before and before["class_path"] != value["class_path"]:
-        old, new = (resolve_name(each["class_path"]) for each in (before, value))
-        derived = isinstance(old, type) and isinstance(new, type) and issubclass(new, old)
-        defaults = inspect.signature(old).parameters
-        for name, setting in list(before.init_args.items(branches=True, nested=False)):
-            if not derived or setting in (None, defaults[name].default):
-                before.init_args.pop(name)
-
-
-check_replaced("jsonargparse", typehints, "discard_init_args_on_class_path_change")
-typehints.discard_init_args_on_class_path_change = _drop_settings_of_another_class
+def default_loggers(folder: Path) -> list[loggers.Logger]:
+    """A CSV logger that writes into ``folder``, and a TensorBoard logger if that is installed."""
+    place: dict[str, Any] = {"save_dir": folder.parent, "name": "", "version": folder.name}
+    found: list[loggers.Logger] = [RunLogger(**place)]
+    if find_spec("tensorboard") is not None:
+        found.append(loggers.TensorBoardLogger(**place, default_hp_metric=False))
+    return found
 
 
 class RunStart(SaveConfigCallback):
@@ -128,11 +89,8 @@ class RunStart(SaveConfigCallback):
             write_text(folder / self.config_filename, self.parser.dump(self.config, skip_none=False))
 
 
-PARSER_SETTINGS: dict[str, Any] = {
-    "prog": "nsvq",
-    **{name: {"description": command.summary} for name, command in COMMANDS.items() if command.module is None},
-}
-PARSER_SETTINGS["fit"]["default_config_files"] = [given.find_config("fast")]
+PARSER_SETTINGS: dict[str, Any] = {name: {"description": COMMANDS[name]} for name in OF_LIGHTNING}
+PARSER_SETTINGS["fit"]["default_config_files"] = [find_config("fast")]
 
 
 # A gate that nobody passes would let a checkpoint import what it names.
@@ -149,7 +107,8 @@ class SplatCLI(LightningCLI):
     """
 
     def __init__(self, args: list[str]) -> None:
-        self._arguments, QuietParser.arguments = args, [*args, *given.settings_of(given.configs_among(args))]
+        self._arguments = args
+        QuietParser.arguments = [*args, *settings_of(configs_among(args))]
         for argument in args:
             check_name(argument, "the command line", allow_outside=True)
         # Texts of settings stand below them; to read them takes seconds, which only this help is worth.
@@ -168,7 +127,7 @@ class SplatCLI(LightningCLI):
                 save_config_callback=RunStart,
                 seed_everything_default=False,  # every draw has its own generator
                 parser_class=QuietParser,
-                parser_kwargs=PARSER_SETTINGS,
+                parser_kwargs={"prog": "nsvq", **PARSER_SETTINGS},
                 subclass_mode_data=True,
                 auto_configure_optimizers=False,  # the module builds its groups
                 args=args,
@@ -207,7 +166,9 @@ class SplatCLI(LightningCLI):
         seed = self._get(self.config, "seed_everything")
         if seed is False:
             return
-        for part in (self._get(self.config, "model"), self._get(self.config, "data").get("init_args", {})):
+        model = self._get(self.config, "model")
+        data = self._get(self.config, "data").get("init_args", {})
+        for part in (model, data):
             if part.get("seed") == 0:  # the default: a seed that was asked for stays
                 part["seed"] = seed
 
@@ -222,17 +183,20 @@ class SplatCLI(LightningCLI):
             FormatError: The checkpoint cannot be used; it is better to fail now than after the scene has been loaded.
             FileNotFoundError: There is no such checkpoint.
         """
-        path = self.config[self.config.subcommand].get("ckpt_path")
-        # Words that Lightning accepts instead of a path; ``last`` and ``best`` refer to its own callback.
-        remote = path is not None and (path.partition(":")[0] in ("hpc", "registry") or "://" in path)
-        if path is not None and (not remote or Path(path).is_file()):
-            settings = read_checkpoint(path).get("hyper_parameters", {})
-            if self.config.subcommand != "fit":
-                check_settings(path, settings, [argument.partition("=")[2] or argument for argument in self._arguments])
-        if self.config.subcommand != "fit":
-            super()._parse_ckpt_path()
-            own = [argument for argument in self._arguments if argument.startswith(("--model.", "--model="))]
-            self.config = self.parser.parse_args([self.config.subcommand, *own], namespace=self.config, defaults=False)
+        subcommand = self.config.subcommand
+        path = self.config[subcommand].get("ckpt_path")
+        settings: dict[str, Any] = {}
+        if path is not None:
+            # Words that Lightning accepts instead of a path; ``last`` and ``best`` refer to its own callback.
+            remote = path.partition(":")[0] in ("hpc", "registry") or "://" in path
+            if not remote or Path(path).is_file():
+                settings = read_checkpoint(path).get("hyper_parameters", {})
+        if subcommand == "fit":
+            return
+        check_settings(path, settings, [argument.partition("=")[2] or argument for argument in self._arguments])
+        super()._parse_ckpt_path()
+        own = [argument for argument in self._arguments if argument.startswith(("--model.", "--model="))]
+        self.config = self.parser.parse_args([subcommand, *own], namespace=self.config, defaults=False)
 
     def instantiate_classes(self) -> None:
         """Make trainer, module and data.
@@ -250,14 +214,16 @@ class SplatCLI(LightningCLI):
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """The trainer without the callbacks that are null, or disabled with the progress bar or checkpoints."""
-        parser = self._parser(self.subcommand)
         settings = self._get(self.config_init, "trainer")
         # Lightning refuses such a callback if the flag disables it, and the default callbacks include one of each.
-        unwanted: list[type] = [type(None)]
-        unwanted += [ProgressBar] if settings.enable_progress_bar is False else []
-        unwanted += [Checkpoint] if settings.enable_checkpointing is False else []
-        given_keys = {key: self._get(self.config_init, key) for key in parser.callback_keys}
-        parser.callback_keys = [key for key, each in given_keys.items() if not isinstance(each, tuple(unwanted))]
+        unwanted: tuple[type, ...] = (type(None),)
+        if settings.enable_progress_bar is False:
+            unwanted += (ProgressBar,)
+        if settings.enable_checkpointing is False:
+            unwanted += (Checkpoint,)
+        parser = self._parser(self.subcommand)
+        keys = parser.callback_keys
+        parser.callback_keys = [key for key in keys if not isinstance(self._get(self.config_init, key), unwanted)]
         if settings.logger in (None, True):
             kwargs["logger"] = False  # until the run has a folder: see RunStart
         if self.subcommand == "validate" and settings.limit_val_batches == 0:
@@ -266,9 +232,10 @@ class SplatCLI(LightningCLI):
 
     def _run_subcommand(self, subcommand: str) -> None:
         """Run a subcommand; say how to continue if training was stopped, for whatever reason."""
+        fits = subcommand == "fit"
         if subcommand != "export":
             try:
-                reserve(self.trainer, self.config[subcommand].get("ckpt_path") if subcommand == "fit" else None)
+                reserve(self.trainer, self.config[subcommand].get("ckpt_path") if fits else None)
             except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
                 raise OSError(
                     f"the folder of the run, {error.filename}, cannot be made ({error.strerror}): name another one "
@@ -277,9 +244,9 @@ class SplatCLI(LightningCLI):
         try:
             super()._run_subcommand(subcommand)
         except BaseException:
-            for callback in self.trainer.callbacks:  # type: ignore[attr-defined]  # Lightning does not type it
-                path = callback.last_path if isinstance(callback, callbacks.RunCheckpoint) else None
-                if subcommand == "fit" and path is not None and self.trainer.is_global_zero:
+            for callback in self.trainer.checkpoint_callbacks if fits else ():
+                path = callback.last_path if isinstance(callback, RunCheckpoint) else None
+                if path is not None and self.trainer.is_global_zero:
                     sys.stderr.write(f"continue with: {continuation(path)}\n")
             raise
 
@@ -302,7 +269,7 @@ def continuation(checkpoint: Path) -> str:
     as_module = Path(sys.argv[0]).parts[-2:] == ("nsvq_lightning", "__main__.py")
     program = ["python", "-m", "nsvq_lightning"] if as_module else ["nsvq"]
     folder = checkpoint.parents[1]
-    options = f"--config={folder / 'config.yaml'}", f"--ckpt_path={checkpoint}", f"--trainer.run_folder={folder}"
+    options = [f"--config={folder / 'config.yaml'}", f"--ckpt_path={checkpoint}", f"--trainer.run_folder={folder}"]
     return shlex.join([*program, "fit", *options])
 
 
@@ -317,123 +284,3 @@ def summary(folder: Path, metrics: dict[str, Any]) -> str:
         f"  {metrics['train_seconds']:.0f} s of training\n"
         f"look at it: open {folder / 'viewer.html'}, or nsvq view {folder}\n"
     )
-
-
-class RunLogger(loggers.CSVLogger):
-    """Lightning's, which a file that another program holds does not end the run."""
-
-    def save(self) -> None:
-        """Write what has been logged; what cannot be written now is written later."""
-        with optional(self.log_dir):
-            super().save()
-
-
-def default_loggers(folder: Path) -> list[loggers.Logger]:
-    """A CSV logger that writes into ``folder``, and a TensorBoard logger if that is installed."""
-    place: dict[str, Any] = {"save_dir": folder.parent, "name": "", "version": folder.name}
-    found: list[loggers.Logger] = [RunLogger(**place)]
-    if find_spec("tensorboard") is not None:
-        found.append(loggers.TensorBoardLogger(**place, default_hp_metric=False))
-    return found
-
-
-class Option(NamedTuple):
-    """An option of the command line."""
-
-    name: str
-    default: Any
-    text: str
-
-
-# Options of the trainer that the help explains; the others are Lightning's, and are listed.
-EXPLAINED = ("run_folder", "allow_other_scene", "max_steps", "accelerator", "devices", "logger", "callbacks")
-
-
-def command_help(parser: LightningArgumentParser, command: str) -> str:
-    """Help text of a command: every option once, with its default and a one-sentence description.
-
-    The parser's own help lists all classes that any option might take, even those of torch, but none of the options of
-    the default callbacks.
-
-    Args:
-        parser: Its parser, with options named ``group.name``.
-        command: Its name.
-    """
-    groups: dict[str, list[Option]] = {"run": [], "callbacks": [], "model": [], "skips": [], "trainer": []}
-    for option in _options(parser):
-        group = option.name.partition(".")[0] if "." in option.name else "run"
-        if group in groups and option.name not in (*groups, "model.splats"):
-            groups[group].append(option)
-    budget = [Option(name, inspect.Parameter.empty, text) for name, text in given.SHORTHANDS.items()]
-    explained = [option for option in groups["trainer"] if option.name.removeprefix("trainer.") in EXPLAINED]
-    others = " ".join(f"--{each.name}{_default(each.default)}" for each in groups["trainer"] if each not in explained)
-    return "\n".join(
-        [
-            f"usage: nsvq {command} [--config NAME] [--OPTION=VALUE ...]\n\n{parser.description}\n",
-            _section("run", groups["run"]),
-            *([_section("budget", budget)] if command == "fit" else []),
-            *([class_help("data", ColmapDataModule)] if command != "export" else []),
-            _section("callbacks", groups["callbacks"], "Their options: --callbacks.density.help; null leaves one out."),
-            _section("model", groups["model"]),
-            _section("skips", groups["skips"]),
-            _section("trainer", explained),
-            *_wrapped(f"Lightning's own: {others}", "  "),
-            "\n--model.quantizer.help=CLASS lists the options of a quantizer; another class for a callback is\n"
-            "--callbacks.density=my_package.Class.\n",
-        ]
-    )
-
-
-def class_help(prefix: str, kind: type) -> str:
-    """Help text for the options of a class, all named ``prefix.…``."""
-    parser = LightningArgumentParser(add_help=False)
-    parser.add_class_arguments(kind, prefix)
-    options = [option for option in _options(parser) if option.name.startswith(f"{prefix}.")]
-    return _section(prefix, options, f"{first_sentence(kind.__doc__)}.")
-
-
-def _options(parser: LightningArgumentParser) -> Iterator[Option]:
-    """The options of a parser, with the defaults of its default config."""
-    defaults = parser.get_defaults()
-    for action in parser._actions:
-        name = (action.option_strings or [""])[-1].lstrip("-").removesuffix("+")
-        if name and not name.endswith(".help"):
-            required = action.default == SUPPRESS or action.required
-            default = inspect.Parameter.empty if required else defaults.get(action.dest)
-            yield Option(name, default, first_sentence(action.help))
-
-
-def first_sentence(text: str | None) -> str:
-    """The first sentence of a docstring or help text, in plain words."""
-    plain = re.sub(r":\w+:`~?(?:[\w.]*\.)?(\w+)`", r"\1", text or "").replace("``", "")
-    plain = re.sub(r"\s+", " ", plain.replace("%%", "%")).strip()
-    return re.split(r"(?<=[a-z0-9)\]]{2}[.:]) (?=[A-Z*])", plain)[0].rstrip(".:") if plain else ""
-
-
-def _section(title: str, options: Iterable[Option], introduction: str = "") -> str:
-    """A section of the help: the title, and for each option a line with its default, and its text below."""
-    lines = [f"{title}:", *_wrapped(introduction, "  ")]
-    for option in options:
-        lines.append(f"  --{option.name}{_default(option.default)}")
-        lines += _wrapped(option.text, " " * 8)
-    return "\n".join(lines) + "\n"
-
-
-# Largest width in columns to which text is wrapped, even on a wider terminal.
-WIDEST = 100
-
-
-def _wrapped(text: str, indent: str) -> list[str]:
-    width = min(shutil.get_terminal_size().columns, WIDEST)
-    return textwrap.wrap(text, width, initial_indent=indent, subsequent_indent=indent)
-
-
-def _default(value: Any) -> str:
-    """``=default`` as one would type it; empty if there is no default."""
-    if isinstance(value, Namespace) and "class_path" in value:
-        return f"={value.class_path.rpartition('.')[2]}"
-    if isinstance(value, tuple | list):
-        return f"=[{','.join(map(str, value))}]"
-    if value is None or isinstance(value, bool):
-        return f"={json.dumps(value)}"
-    return f"={value}" if isinstance(value, int | float | str) else ""

@@ -16,8 +16,9 @@ from importlib import import_module
 from traceback import walk_tb
 from typing import Any, TextIO
 
-from nsvq_lightning.commands import arguments as given
-from nsvq_lightning.commands.registry import COMMANDS, overview
+from nsvq_lightning.commands import COMMANDS, OF_LIGHTNING, nearest, overview, say
+from nsvq_lightning.commands.arguments import Parser
+from nsvq_lightning.commands.settings import FIT_HELP, check_early, configs_among, expand, limit_aliases
 from nsvq_lightning.version import __version__
 
 # Environment variable that makes errors show their traceback.
@@ -37,23 +38,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         the process with status 2.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    if not arguments or arguments[0] in ("--help", "-h", "help"):
+    name = arguments[0] if arguments else ""
+    if name in ("", "--help", "-h", "help"):
         sys.stdout.write(overview())
-        return 0 if arguments else 2
-    if arguments[0] == "--version":
-        sys.stdout.write(f"nsvq {__version__}\n")
+        return 0 if name else 2
+    if name == "--version":
+        say(f"nsvq {__version__}")
         return 0
     # A pipe, too, shows lines as they come; on Windows it accepts only the locale's characters.
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace", line_buffering=True)
     try:
-        if arguments[0] in COMMANDS and COMMANDS[arguments[0]].module is not None:
-            return run_command(arguments[0], arguments[1:])
-        if arguments[0] not in COMMANDS and not arguments[0].startswith("-"):
-            meant = given.nearest(arguments[0], COMMANDS)
-            sys.stderr.write(f"error: there is no command {arguments[0]!r}{meant}\nAll commands: nsvq --help\n")
-            return 2
-        return _run_lightning(arguments, own_process=argv is None)
+        if name in OF_LIGHTNING or name.startswith("-"):
+            return _run_lightning(arguments, own_process=argv is None)
+        if name in COMMANDS:
+            return run_command(name, arguments[1:])
+        return _failed(f"error: there is no command {name!r}{nearest(name, COMMANDS)}\nAll commands: nsvq --help", 2)
     except KeyboardInterrupt:
         sys.stderr.write("\n")  # below the ^C that the terminal shows
         return INTERRUPTED
@@ -62,16 +62,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         lacks_memory = isinstance(error, MemoryError) or re.search("allocate memory|out of memory", str(error))
         if os.environ.get(TRACEBACK) or not lacks_memory:
             raise
-        sys.stderr.write(
+        return _failed(
             "error: there is not enough memory: close other programs, or take fewer splats (--splats), smaller photos "
-            f"(--data.factor) or a smaller scene ({TRACEBACK}=1 shows where)\n"
+            f"(--data.factor) or a smaller scene ({TRACEBACK}=1 shows where)"
         )
-        return 1
     except ModuleNotFoundError as error:
         if error.name != "cv2":
             raise
-        sys.stderr.write("error: OpenCV (cv2) is missing: pip install opencv-contrib-python-headless, or any other\n")
-        return 1
+        return _failed("error: OpenCV (cv2) is missing: pip install opencv-contrib-python-headless, or any other")
+
+
+def _failed(message: str, status: int = 1) -> int:
+    """Say why a command has failed; returns its exit status."""
+    sys.stderr.write(f"{message}\n")
+    return status
 
 
 def lightning(argv: Sequence[str] | None = None) -> int:
@@ -95,11 +99,11 @@ def lightning(argv: Sequence[str] | None = None) -> int:
     scripts = {re.sub(r"[-_.]+", "-", point.dist.name).lower(): point for point in points if point.dist is not None}
     scripts.pop("nsvq-lightning", None)
     if not scripts:
-        sys.stderr.write(
+        return _failed(
             f"lightning: unknown command {arguments[0]!r}; nsvq-lightning has {', '.join(COMMANDS)}, "
-            "and no other installed package has a lightning command\n"
+            "and no other installed package has a lightning command",
+            2,
         )
-        return 2
     sys.argv = ["lightning", *arguments]
     sys.exit(scripts[min(scripts)].load()())
 
@@ -112,16 +116,20 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     and :class:`ValueError` or :class:`OSError` for what is wrong with the user's files.
 
     Args:
-        name: One of :data:`~nsvq_lightning.commands.registry.COMMANDS` that has a module.
+        name: One of :data:`~nsvq_lightning.commands.COMMANDS` that is not Lightning's.
         arguments: What follows the name.
 
     Returns:
         Exit status: what ``run`` returns, or 1 after an error in the user's files.
     """
-    command = import_module(str(COMMANDS[name].module))
+    command = import_module(f"{__package__}.{name}")
     about, _, more = inspect.cleandoc(command.__doc__ or "").partition("\n\n")
-    form = argparse.RawDescriptionHelpFormatter
-    parser = given.Parser(prog=f"nsvq {name}", description=about, epilog=more, formatter_class=form)
+    parser = Parser(
+        prog=f"nsvq {name}",
+        description=about,
+        epilog=more,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     command.add_arguments(parser)
     options, further = parser.parse_known_args(arguments)
     if further:
@@ -140,23 +148,21 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
         text = str(error)
         if isinstance(error, OSError) and error.filename is not None:
             text = f"{error.filename}: {error.strerror}"
-        sys.stderr.write(f"nsvq {name}: {text}\n")
-        return 1
+        return _failed(f"nsvq {name}: {text}")
 
 
 def _run_lightning(arguments: list[str], own_process: bool) -> int:
     if arguments == ["fit", "--help"]:
-        sys.stdout.write(given.FIT_HELP.read_text(encoding="utf-8"))
+        sys.stdout.write(FIT_HELP.read_text(encoding="utf-8"))
         return 0
     try:
-        arguments = given.expand(arguments)
-        given.check_early(arguments)
+        arguments = expand(arguments)
+        check_early(arguments)
     except argparse.ArgumentError as error:
         sys.stderr.write(f"error: {error}\nAll options: nsvq {arguments[0]} --help\n")
         sys.exit(2)
     except (ValueError, OSError) as error:
-        sys.stderr.write(f"error: {error}\n")
-        return 1
+        return _failed(f"error: {error}")
     # Fragments of Lightning's and torch's warnings that a user of this command can do nothing about.
     not_actionable = (
         "does not have many workers",  # views come from a cache in memory; each worker would hold a copy
@@ -180,8 +186,8 @@ def _run_lightning(arguments: list[str], own_process: bool) -> int:
     _quiet_lightning()
     if os.getcwd() not in sys.path:  # last, unlike `python -m`: for the user's own quantizers and callbacks
         sys.path.append(os.getcwd())
-    given.limit_aliases()
-    configs = given.configs_among(arguments)
+    limit_aliases()
+    configs = configs_among(arguments)
     try:
         run_cli(arguments)
     except SIGTERMException:  # a kind of SystemExit
@@ -197,8 +203,7 @@ def _run_lightning(arguments: list[str], own_process: bool) -> int:
         speaks = names_file or isinstance(error, MisconfigurationException) or _is_ours(error)
         if os.environ.get(TRACEBACK) or not speaks:
             raise
-        sys.stderr.write(f"error: {error}\n({TRACEBACK}=1 shows where)\n")
-        return 1
+        return _failed(f"error: {error}\n({TRACEBACK}=1 shows where)")
     return 0
 
 

@@ -27,7 +27,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nsvq_lightning.commands import arguments as given
+from nsvq_lightning.commands.arguments import integers, names
+from nsvq_lightning.commands.settings import expand
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.version import __version__
 
@@ -41,12 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(further=())
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="where all results go")
     add = parser.add_argument_group("what is combined; lists have commas between their entries").add_argument
-    listed: dict[str, Any] = {"type": given.names, "default": ()}
+    listed: dict[str, Any] = {"type": names, "default": ()}
     add("--scenes", **listed, metavar="A,B", help="COLMAP folders (default: that of the configuration)")
     add("--configs", **listed, metavar="A,B", help="files or shipped names, as for nsvq fit --config")
     add("--quantizers", **listed, metavar="A,B", help="classes, as for nsvq fit --model.quantizer")
     add("--codebooks", **listed, metavar="1k,4k", help="sizes, for configurations that have codebooks")
-    add("--seeds", type=given.integers, default=(), metavar="0,1,2", help="of the draws and of the order of the views")
+    add("--seeds", type=integers, default=(), metavar="0,1,2", help="of the draws and of the order of the views")
     add("--max-steps", type=int, metavar="N", help="iterations of every run (default: those of its configuration)")
     parser.add_argument("--keep-checkpoints", action="store_true", help="keep those of finished runs")
     help_ = "only print a command for each unfinished run, to be run anywhere"
@@ -148,13 +149,13 @@ def plan(options: argparse.Namespace) -> list[Run]:
             chosen = [("data.root", Path(root).resolve()), ("model.quantizer", quantizer), ("model.codebooks", size)]
             chosen += [("model.seed", seed), ("data.seed", seed)]
             text = resolve([*arguments, *(f"--{option}={value}" for option, value in chosen if value != "")])
-            names = {"scene": Path(root).resolve().name, "config": Path(config).stem or "default"}
-            names |= {"quantizer": quantizer.rpartition(".")[2], "codebooks": size, "seed": seed}
-            title = "-".join(str(name) for name in names.values() if name != "")
-            if any(run.names == names for run in runs):
+            labels = {"scene": Path(root).resolve().name, "config": Path(config).stem or "default"}
+            labels |= {"quantizer": quantizer.rpartition(".")[2], "codebooks": size, "seed": seed}
+            title = "-".join(str(name) for name in labels.values() if name != "")
+            if any(run.names == labels for run in runs):
                 raise ValueError(f"two runs are called {title}: rename a scene or configuration to tell them apart")
             digest = hashlib.sha256(f"{__version__}\n{text}".encode()).hexdigest()
-            runs.append(Run(names, text, options.output.resolve() / "runs" / f"{title}-{digest[:12]}"))
+            runs.append(Run(labels, text, options.output.resolve() / "runs" / f"{title}-{digest[:12]}"))
     return runs
 
 
@@ -170,7 +171,7 @@ def resolve(arguments: Sequence[str]) -> str:
     printed = io.StringIO()
     with warnings.catch_warnings(action="ignore"), redirect_stdout(printed):
         try:
-            SplatCLI(["fit", *given.expand(arguments), "--print_config"])
+            SplatCLI(["fit", *expand(arguments), "--print_config"])
         except SystemExit as end:
             if end.code:
                 raise

@@ -13,7 +13,7 @@ from jsonargparse import set_parsing_settings
 from nsvq_lightning import callbacks
 from nsvq_lightning.callbacks.base import SplatCallback
 from nsvq_lightning.callbacks.settings import Bound, Count, Factor, NonNegative, Opacity, Positive, Share, Whole
-from nsvq_lightning.commands.fit import class_help
+from nsvq_lightning.commands.parser import class_help
 
 
 @dataclass(eq=False)

@@ -1,12 +1,88 @@
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 
 import pytest
 from splat_scenes import random_splats
 
-from nsvq_lightning.commands.arguments import cameras_of, views_of
+from nsvq_lightning.commands.arguments import (
+    Parser,
+    cameras_of,
+    integers,
+    names,
+    photos_of,
+    positive,
+    scene_file,
+    some_of,
+    unknown_option,
+    views_of,
+)
+
+
+def test_lists_have_each_entry_once() -> None:
+    assert names(" a, b,,a ") == ("a", "b")
+    assert integers("3,1,3") == (3, 1)
+    assert some_of("abc")("c, a") == ("c", "a")
+    assert some_of("abc")("all") == ("a", "b", "c")
+
+
+@pytest.mark.parametrize("text", ["", ",", "a,d", "all,a"])
+def test_only_known_names_are_taken(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match=f"choose some of a, b, c, or all, got '{text}'"):
+        some_of("abc")(text)
+
+
+@pytest.mark.parametrize("text", ["", "1,,2", "1.5", "one"])
+def test_only_whole_numbers_are_taken(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="expected whole numbers with commas between them"):
+        integers(text)
+
+
+@pytest.mark.parametrize(("kind", "text"), [(int, "0"), (int, "-3"), (float, "inf"), (float, "nan"), (float, "-0.0")])
+def test_numbers_are_above_0(kind: type[int] | type[float], text: str) -> None:
+    assert positive(kind)("2") == 2
+    with pytest.raises(argparse.ArgumentTypeError, match=f"must be above 0, got {text}"):
+        positive(kind)(text)
+
+
+def test_a_misspelt_option_is_told_from_other_messages(capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--port", "--host", "--data.root", "--data.help", "-o"]
+    assert unknown_option("unrecognized arguments: --prot=3", options) == "; did you mean --port?"
+    assert unknown_option("Option 'data.rot' is not accepted", options) == "; did you mean --data.root?"
+    assert unknown_option("unrecognized arguments: --nothing_like_it", options) == ""
+    assert unknown_option("argument --prot: must be above 0", options) == ""
+    parser = Parser(prog="nsvq test")
+    parser.add_argument("--port")
+    with pytest.raises(SystemExit) as stop:
+        parser.parse_args(["--prot", "3"])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.endswith("unrecognized arguments: --prot 3; did you mean --port?\n")
+
+
+def test_a_scene_is_a_file_or_that_of_a_run(tmp_path: Path) -> None:
+    file = tmp_path / "version_3" / "scene.nsvq"
+    file.parent.mkdir()
+    file.touch()
+    assert scene_file(file) == scene_file(file.parent) == file
+    with pytest.raises(ValueError, match=f"holds no scene.nsvq: .*, such as {file.parent}"):
+        scene_file(tmp_path)
+    with pytest.raises(FileNotFoundError, match="there is no file or folder"):
+        scene_file(tmp_path / "other.ply")
+    (tmp_path / "last.ckpt").touch()
+    with pytest.raises(ValueError, match="is a checkpoint; 'nsvq export --ckpt_path "):
+        scene_file(tmp_path / "last.ckpt")
+
+
+def test_a_run_says_where_its_photos_are(tmp_path: Path) -> None:
+    config = tmp_path / "config.yaml"
+    for content, photos in (("root: {folder}", tmp_path), ("root: {folder}/gone", None), ("factor: 2", None)):
+        config.write_text("data: {init_args: {" + content.format(folder=tmp_path) + "}}")
+        assert photos_of(tmp_path) == photos_of(tmp_path / "scene.nsvq") == photos
+    config.unlink()
+    assert photos_of(tmp_path) is None
+
 
 ENTRY = {"img_name": "a", "width": 8, "height": 6, "fx": 7, "fy": 7, "position": [0, 0, -3]}
 ENTRY["rotation"] = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]

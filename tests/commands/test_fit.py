@@ -12,7 +12,6 @@ import torch
 import yaml
 from small_demo import write_small_demo
 
-from nsvq_lightning.commands.arguments import check_config, expand, find_config
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.io.nsvq.file import read_nsvq
@@ -304,59 +303,6 @@ def test_the_papers_settings_survive_another_class(capsys: pytest.CaptureFixture
     assert callbacks["phases"]["init_args"]["quantize_end"] == 43_000
     assert callbacks["density"]["class_path"].endswith("DensityControl")
     assert callbacks["density"]["init_args"]["start"] == 600
-
-
-def test_configs_are_found_as_files_first_then_by_name(tmp_path: Path) -> None:
-    mine = tmp_path / "paper.yaml"
-    mine.write_text("{}")
-    shipped = find_config("paper")
-    assert shipped.endswith("configs/paper.yaml")
-    assert find_config(str(mine)) == str(mine)
-    assert find_config("configs/paper.yaml").endswith("configs/paper.yaml")
-    assert find_config("no_such_config") == "no_such_config"
-    arguments = ["fit", "--config", "paper", "--data.root", "paper", "--config=paper", "-c", str(mine)]
-    assert expand(arguments) == [
-        *("fit", f"--config={shipped}", f"--config={shipped}", f"--config={mine}", "--data.root=paper")
-    ]
-
-
-def _nines(first: str, next_: str) -> bytes:
-    """A short config of ten lines, each of which holds the one before nine times."""
-    lines = [f"k{i}: &k{i} {next_ % ', '.join([f'*k{i - 1}'] * 9)}" for i in range(1, 10)]
-    return "\n".join([f"k0: &k0 {first}", *lines]).encode()
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "holds nothing: give settings by name"),
-        (b"- 1\n", "holds list: give settings by name"),
-        (b"5", "holds int: give"),
-        (b"a: [1, {", "is not YAML .*: correct the file"),
-        (b"\xff\xfe\0", "is not YAML .*can't decode"),
-        (b"#" * 200_000, "has 200000 bytes"),
-        (b"[" * 100_000, "is not YAML .*recursion"),
-        (b"a: &a {b: *a}", "is not YAML .*more than 100000 values by aliases"),
-        (_nines("[1]", "[%s]"), "is not YAML .*more than 100000 values"),
-        (_nines("{c: 1}", "{<<: [%s]}"), "is not YAML .*more than 100000 values"),
-    ],
-)
-def test_what_cannot_be_a_config(tmp_path: Path, content: bytes, message: str) -> None:
-    path = tmp_path / "mine.yaml"
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=rf"mine\.yaml {message}"):
-        check_config(str(path))
-    check_config(str(tmp_path / "none.yaml"))  # the parser's to complain about
-
-
-def test_a_config_that_a_config_names_may_not_explode_either(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    (tmp_path / "inner.yaml").write_bytes(_nines("[1]", "[%s]"))
-    (tmp_path / "outer.yaml").write_text(json.dumps({"data": str(tmp_path / "inner.yaml")}))
-    with pytest.raises(SystemExit):
-        main(["fit", "--config", str(tmp_path / "outer.yaml")])
-    assert re.search(r"inner\.yaml: more than 100000 values by aliases", capsys.readouterr().err)
 
 
 def test_wrong_settings_name_the_file_they_came_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import gc
-import inspect
-import io
 import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,13 +17,10 @@ import torch
 from viewer_scenes import plain_scene
 
 import nsvq_lightning
-from nsvq_lightning.callbacks import STANDARD
-from nsvq_lightning.commands import arguments as given
+from nsvq_lightning.commands import COMMANDS, OF_LIGHTNING, settings
 from nsvq_lightning.commands import main as main_module
-from nsvq_lightning.commands.arguments import FIT_HELP, check_early
-from nsvq_lightning.commands.fit import SplatCLI, class_help
+from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.commands.main import main
-from nsvq_lightning.commands.registry import COMMANDS
 from nsvq_lightning.io import write_ply
 
 
@@ -42,8 +35,7 @@ def test_version_and_overview_come_without_torch(argument: str, said: str) -> No
     assert said in done.stdout
     if argument == "--help":
         assert all(
-            re.search(rf"^  {name} +{re.escape(command.summary)}$", done.stdout, re.M)
-            for name, command in COMMANDS.items()
+            re.search(rf"^  {name} +{re.escape(summary)}$", done.stdout, re.M) for name, summary in COMMANDS.items()
         )
 
 
@@ -55,7 +47,7 @@ def test_help_of_commands_without_training_comes_without_torch() -> None:
         "    except SystemExit as end: assert not end.code\n"
         "assert not {'torch', 'numba', 'lightning'} & set(sys.modules)"
     )
-    names = [name for name, command in COMMANDS.items() if command.module is not None]
+    names = [name for name in COMMANDS if name not in OF_LIGHTNING]
     done = subprocess.run([sys.executable, "-c", code, *names], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.count("\nExamples:\n") == len(names) - 1  # info has none
@@ -64,58 +56,6 @@ def test_help_of_commands_without_training_comes_without_torch() -> None:
 def test_no_command_is_an_error_that_shows_them(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 2
     assert "nsvq COMMAND --help" in capsys.readouterr().out
-
-
-@pytest.fixture(scope="module")
-def fit_help() -> str:
-    """What Lightning's parser says."""
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(io.StringIO()) as printed:
-        patch.setenv("COLUMNS", "80")
-        with pytest.raises(SystemExit):
-            SplatCLI(["fit", "--help"])
-    return printed.getvalue()
-
-
-def test_the_stored_help_of_fit_is_that_of_the_parser(fit_help: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fit", "--help"]) == 0
-    stored = capsys.readouterr().out
-    if stored != fit_help:
-        FIT_HELP.write_text(fit_help, encoding="utf-8")
-    assert stored == fit_help, f"{FIT_HELP} has been written anew: look at the difference, and commit it"
-
-
-def test_help_says_what_there_is_and_names_none_of_torchs_classes(fit_help: str) -> None:
-    for key, kind in STANDARD.items():
-        assert f"--callbacks.{key}" in fit_help or not inspect.signature(kind).parameters
-    assert "--data.root\n        Scene folder" in fit_help
-    assert "--trainer.max_steps=4500" in fit_help
-    assert "torch.nn" not in fit_help
-    assert len(fit_help.splitlines()) < 510
-    assert max(len(line) for line in fit_help.splitlines() if line.startswith("        ")) <= 80
-
-
-def test_options_that_the_readme_names_are_in_the_help(fit_help: str) -> None:
-    root = Path(__file__).resolve().parents[2]
-    if not (root / "README.md").exists():
-        pytest.skip("a source distribution has no README beside the tests")
-    pages = "".join(path.read_text(encoding="utf-8") for path in (root / "README.md", root / "docs" / "your_photos.md"))
-    named = {
-        name
-        for name in re.findall(r"--((?:callbacks|data|model|trainer)\.[\w.]*\w)", pages)
-        if "quantizer." not in name
-    }
-    assert {"data.root", "data.factor"} <= named
-    known = fit_help + "".join(class_help(f"callbacks.{key}", kind) for key, kind in STANDARD.items())
-    assert {name for name in named if f"--{name}" not in known} == set()
-
-
-def test_one_callback_says_what_it_takes(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as end:
-        main(["fit", "--callbacks.density.help"])
-    assert end.value.code == 0
-    out = capsys.readouterr().out
-    assert out.startswith("callbacks.density:\n  Splits splats where the photos have edges")
-    assert "--callbacks.density.grad_threshold=0.0003\n" in out
 
 
 @pytest.mark.usefixtures("help_of_here")
@@ -191,25 +131,7 @@ def test_wrong_arguments_are_explained(
 @pytest.fixture
 def help_of_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take the stored help for that of the versions that are installed, whichever they are."""
-    monkeypatch.setattr(given, "FIT_HELP_OF", {name: version(name) for name in given.FIT_HELP_OF})
-
-
-@pytest.mark.usefixtures("help_of_here")
-@pytest.mark.parametrize("name", ["lightning", "jsonargparse"])
-def test_options_of_another_lightning_are_left_to_its_parser(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
-) -> None:
-    (tmp_path / "transforms.json").touch()
-    options = ["fit", f"--data.root={tmp_path}", "--trainer.of_tomorrow=1"]
-    with pytest.raises(argparse.ArgumentError, match=r"no option --trainer\.of_tomorrow"):
-        given.check_early(options)
-    monkeypatch.setitem(given.FIT_HELP_OF, name, "0.0")
-    given.check_early(options)
-
-
-def test_the_stored_help_is_of_the_versions_that_were_tested() -> None:
-    pins = (Path(__file__).parents[2] / "constraints.txt").read_text(encoding="utf-8").splitlines()
-    assert {f"{name}=={version}" for name, version in given.FIT_HELP_OF.items()} <= set(pins)
+    monkeypatch.setattr(settings, "FIT_HELP_OF", {name: version(name) for name in settings.FIT_HELP_OF})
 
 
 @pytest.mark.parametrize("collects", [True, False])
@@ -228,13 +150,6 @@ def test_a_host_keeps_its_collector(monkeypatch: pytest.MonkeyPatch, collects: b
     finally:
         gc.unfreeze()
         gc.enable()
-
-
-def test_a_tilde_is_the_home_folder(make_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(make_scene().parent))
-    check_early(["fit", "--data.root=~/scene"])
-    with pytest.raises(FileNotFoundError, match=r"scene folder ~/other does not exist"):
-        check_early(["fit", "--data.root=~/other"])
 
 
 def test_commands_that_do_not_exist_or_contradict_themselves_are_told_so(capsys: pytest.CaptureFixture[str]) -> None:
@@ -342,7 +257,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
 
 
 def test_the_words_are_those_of_the_main_module() -> None:
-    assert {name for name, command in COMMANDS.items() if command.module is None} == set(SplatCLI.subcommands())
+    assert set(OF_LIGHTNING) == set(SplatCLI.subcommands()) < set(COMMANDS)
 
 
 @pytest.mark.parametrize("arguments", [["fit", "--config", "a.yaml"], ["info", "x.ply"], ["validate"], ["--help"], []])

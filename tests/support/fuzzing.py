@@ -282,7 +282,7 @@ def _read_checkpoint(path: Path) -> object:
 
 
 def _build_config(folder: Path) -> list[Path]:
-    from nsvq_lightning.commands.arguments import find_config
+    from nsvq_lightning.commands.settings import find_config
 
     files = []
     for name in ("paper", "best", "demo"):
@@ -309,7 +309,7 @@ def _parser() -> Callable[[list[str]], object]:
 
 def _read_config(path: Path) -> object:
     """Parse it as ``nsvq fit`` would; what is wrong ends the command with status 2 and a message."""
-    from nsvq_lightning.commands.arguments import check_config
+    from nsvq_lightning.commands.settings import check_config
 
     check_config(str(path))
     status: object = 0

@@ -1,52 +1,30 @@
-"""Run time against error: every fast part of the package measured beside its plain counterpart and a float64 oracle.
+"""Measure run time against error: each part beside its plain counterpart and a float64 oracle.
 
-Here is only what is measured, and how thoroughly: arguments are refused before torch is loaded.
+Suites:
+  render     back-ends of the rasterizer and of the loss, forward and backward, against float64
+  quantize   a step of NSVQ, and the search for the nearest code
+  codec      writing and reading scene files
+  train      whole runs, with switches on and off
+
+Examples:
+  nsvq benchmark all --quick
+  nsvq benchmark render > render.md
+  nsvq benchmark train --scene path/to/colmap/folder --switches all
+  nsvq benchmark quantize,codec --scene scene.ply
 """
 
-from dataclasses import dataclass
+import argparse
+import importlib
+import logging
+import sys
+import time
 from pathlib import Path
+
+from nsvq_lightning.commands.arguments import positive, some_of
+from nsvq_lightning.skips import SKIPS
 
 # Modules of this package; each has a function ``run(scope)``, which returns measurements.
 SUITES = ("render", "quantize", "codec", "train")
-
-
-@dataclass(frozen=True)
-class Scope:
-    """What is measured, and how thoroughly: what the command line says, with its defaults filled in.
-
-    Attributes:
-        quick: Small workloads and few repeats, for continuous integration.
-        repeats: Timed calls of each case, at least 1.
-        seconds: A case is not called again once its calls have taken this long together.
-        workloads: Names of synthetic scenes of ``render`` and ``codec``.
-        scene: Scene file or COLMAP folder that is measured instead of the synthetic scenes.
-        init_from: Scene file whose splats are seen by the cameras of the COLMAP folder ``scene``, instead of its
-            points.
-        steps: Iterations of each run of ``train``, at least 4: a phase has one at least.
-        switches: Names of :data:`nsvq_lightning.skips.SKIPS` that ``train`` inverts one by one.
-        config: Config of the runs of ``train``; by default ``fast.yaml``, without photos ``demo.yaml``.
-    """
-
-    quick: bool = False
-    repeats: int = 15
-    seconds: float = 5.0
-    workloads: tuple[str, ...] = ("A20k", "B100k", "C500k")
-    scene: Path | None = None
-    init_from: Path | None = None
-    steps: int = 1000
-    switches: tuple[str, ...] = ()
-    config: str | None = None
-
-    @property
-    def photos(self) -> Path | None:
-        """The COLMAP folder, if the scene is one."""
-        return self.scene if self.scene is not None and self.scene.is_dir() else None
-
-    @property
-    def codebooks(self) -> str:
-        """The paper's codebook setting in the suites that quantize."""
-        return "1k" if self.quick else "16k"
-
 
 # The synthetic scenes by name: splats, pixels across and down, and the median length of a splat's axes in scene units.
 # Splats are smaller where there are more, as training leaves them.
@@ -58,5 +36,65 @@ SIZES = {
     "E3M": (3_000_000, 1600, 1060, 0.0031),
 }
 
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what ``nsvq benchmark`` takes."""
+    help_ = f"of {', '.join(SUITES)}: one, some with commas between them, or all"
+    parser.add_argument("suites", type=some_of(SUITES), metavar="SUITE", help=help_)
+    add = parser.add_argument_group("what is measured").add_argument
+    help_ = f"synthetic scenes, some of {','.join(SIZES)} (A20k,B100k,C500k; quick A20k)"
+    add("--workloads", type=some_of(SIZES), metavar="NAME,NAME", help=help_)
+    add("--scene", type=Path, metavar="PATH", help="scene file or COLMAP folder, not synthetic ones")
+    help_ = "scene file whose splats are used with the photos of the COLMAP folder, instead of its points"
+    add("--init-from", type=Path, metavar="FILE", help=help_)
+    add("--config", metavar="NAME", help="config of the runs of train (fast.yaml, without photos demo.yaml)")
+    add("--steps", type=positive(int), metavar="N", help="iterations of each run of train (1000; quick 40)")
+    help_ = "switches that train inverts one by one, or all"
+    add("--switches", type=some_of(SKIPS), metavar="NAME,NAME", help=help_)
+    add = parser.add_argument_group("how much").add_argument
+    add("--quick", action="store_true", help="small workloads, few repeats: all within a minute")
+    add("--repeats", type=positive(int), metavar="N", help="timed calls of each case (15; quick 3)")
+
+
 # What --quick changes of a scope.
 QUICK = {"repeats": 3, "seconds": 0.5, "workloads": ("A20k",), "steps": 40}
+
+
+def run(options: argparse.Namespace) -> int:
+    """Measure, and print the tables.
+
+    Raises:
+        argparse.ArgumentError: Options do not go together, or a number is out of range.
+        ValueError: The scene cannot be used.
+        OSError: A file cannot be read.
+    """
+    steps, scene = options.steps, options.scene
+    # Arguments are refused before torch is loaded.
+    if steps is not None and steps < 4:
+        raise argparse.ArgumentError(None, f"--steps must be at least 4, one for each phase, got {steps}")
+    if options.init_from is not None and not (scene is not None and scene.is_dir()):
+        message = "--init-from needs a COLMAP folder as --scene, whose cameras look at its splats"
+        raise argparse.ArgumentError(None, message)
+    from nsvq_lightning.commands.benchmark.timing import Scope, as_markdown, describe_machine
+    from nsvq_lightning.data.scene import load_scene
+    from nsvq_lightning.io.formats import read_scene
+
+    given = {name: value for name, value in vars(options).items() if name != "suites" and value is not None}
+    scope = Scope(**{**(QUICK if options.quick else {}), **given})
+    logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
+    # Before anything is measured: a wrong file must end in one line.
+    file = scene
+    if scope.photos is not None:
+        load_scene(scope.photos)
+        file = options.init_from
+    if file is not None:
+        read_scene(file)
+    about = describe_machine()  # as busy as the machine is before
+    found = {}
+    for name in options.suites:
+        suite = importlib.import_module(f"{__package__}.{name}")
+        start = time.perf_counter()
+        found[name] = list(suite.run(scope))
+        sys.stderr.write(f"{name}: {time.perf_counter() - start:.1f} s\n")
+    sys.stdout.write(as_markdown(about, scope, found))
+    return 0

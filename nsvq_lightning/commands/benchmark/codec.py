@@ -1,14 +1,15 @@
 """Suite ``codec``: writing and reading scene files."""
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark import Scope, quantize, timing
+from nsvq_lightning.commands.benchmark import quantize
+from nsvq_lightning.commands.benchmark.timing import Measurement, Scope, compare
 from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.compression.stored import to_compressed
 from nsvq_lightning.io.formats import load, save
@@ -18,34 +19,40 @@ from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import SplatTensors
 
 
-def run(scope: Scope) -> Iterator[timing.Measurement]:
+def run(scope: Scope) -> Iterator[Measurement]:
     """Time writing and reading."""
     for workload in workloads(scope):
         with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder:
             yield from _file_rows(workload, scope, Path(folder))
 
 
-def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[timing.Measurement]:
-    values: dict[str, Mapping[str, float]] = {}
-    paths: dict[str, Path] = {}
+def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Measurement]:
+    splats = workload.splats
     # Codebooks of one step of k-means: sizes and times do not depend on how good they are.
-    fitted = quantize.prepare(workload.splats, scope.codebooks)
-    scene = to_compressed(workload.splats, {name: as_quantizer(each.quantizer) for name, each in fitted.items()})
-    writers: dict[str, Callable[[Path], int]] = {".ply": partial(save, workload.splats)}
-    writers |= {f".nsvq {level}": partial(save, scene, storage=Storage(level)) for level in LEVELS}
-    images = {".ply": _image(workload, workload.splats), ".nsvq": _image(workload, scene.decode())}
+    fitted = quantize.prepare(splats, scope.codebooks)
+    scene = to_compressed(splats, {name: as_quantizer(each.quantizer) for name, each in fitted.items()})
+    writers: dict[str, Callable[[Path], int]] = {".ply": partial(save, splats)}
+    for level in LEVELS:
+        writers[f".nsvq {level}"] = partial(save, scene, storage=Storage(level))
+    truths = {".ply": _image(workload, splats), ".nsvq": _image(workload, scene.decode())}
+    writes = {}
+    reads: dict[str, Callable[[], object]] = {}
+    values = {}
     for name, write in writers.items():
-        suffix = name.partition(" ")[0]
-        path = paths[name] = folder / f"scene{len(paths)}{suffix}"
+        suffix = name.split()[0]
+        path = folder / f"scene{len(reads)}{suffix}"
+        writes[name] = partial(write, path)
+        reads[name] = partial(load, path)
         size = write(path)
-        error = float((_image(workload, load(path)) - images[suffix]).abs().mean())
-        each = size / len(workload.splats.means)
-        values[name] = {"bytes a splat": each, "bytes": float(size), "image error": error}
+        error = _image(workload, load(path)) - truths[suffix]
+        values[name] = {
+            "bytes a splat": size / len(splats.means),
+            "bytes": float(size),
+            "image error": float(error.abs().mean()),
+        }
     described = f"{workload.name}, {scope.codebooks} codebooks"
-    writes = {name: partial(write, paths[name]) for name, write in writers.items()}
-    reads = {name: partial(load, path) for name, path in paths.items()}
-    yield from timing.compare("write", described, writes, values, scope)
-    yield from timing.compare("read", described, reads, values, scope)
+    yield from compare("write", described, writes, values, scope)
+    yield from compare("read", described, reads, values, scope)
 
 
 @torch.no_grad()

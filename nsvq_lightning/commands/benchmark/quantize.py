@@ -1,6 +1,8 @@
 """Suite ``quantize``: a step of NSVQ, and the search for the nearest code in it."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from typing import NamedTuple, cast
@@ -8,16 +10,16 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark import Scope
-from nsvq_lightning.commands.benchmark.timing import Measurement, compare
-from nsvq_lightning.commands.benchmark.workloads import relative_l2, synthetic_workload, workloads
+from nsvq_lightning.commands.benchmark.timing import Measurement, Scope, compare
+from nsvq_lightning.commands.benchmark.workloads import relative_l2, workloads
 from nsvq_lightning.quantize import NSVQ, CodebookQuantizer, nearest, nearest_reference
 from nsvq_lightning.quantize.attributes import attribute_rows, build_quantizers
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.optim import LearningRates
 
-STEP, SEARCH = "step, forward + backward", "search"
+STEP = "step, forward + backward"
+SEARCH = "search"
 
 
 class Attribute(NamedTuple):
@@ -44,22 +46,33 @@ Results = dict[str, tuple[Tensor, Tensor, Tensor]]
 
 def run(scope: Scope) -> Iterator[Measurement]:
     """Time every operation."""
-    source = synthetic_workload("A20k" if scope.quick else "B100k") if scope.scene is None else workloads(scope)[0]
-    attributes = prepare(source.splats, scope.codebooks)
+    if scope.scene is None:
+        scope = replace(scope, workloads=("A20k" if scope.quick else "B100k",))
+    (workload,) = workloads(scope)
+    attributes = prepare(workload.splats, scope.codebooks)
     for name, attribute in attributes.items():
-        x, codebook = attribute.x.detach(), attribute.quantizer.codebook.detach()
-        seen, size = x[attribute.rows], f"D {x.shape[1]}, K {len(codebook)}"
-        searches = {"nsvq_lightning": nearest, "cdist + argmin": _by_distances}
-        cases = {method: partial(search, seen, codebook) for method, search in searches.items()}
-        errors = {method: code_errors(seen, codebook, call()) for method, call in cases.items()}
-        yield from compare(SEARCH, f"{name}: {len(seen)} rows, {size}", cases, errors, scope)
+        rows = attribute.x.detach()[attribute.rows]
+        codebook = attribute.quantizer.codebook.detach()
+        cases = {
+            "nsvq_lightning": partial(nearest, rows, codebook),
+            "cdist + argmin": partial(_by_distances, rows, codebook),
+        }
+        errors = {method: code_errors(rows, codebook, call()) for method, call in cases.items()}
+        described = f"{name}: {len(rows)} rows, D {rows.shape[1]}, K {len(codebook)}"
+        yield from compare(SEARCH, described, cases, errors, scope)
     # The step comes last: it moves rows and codes, and the search measures them as they are fitted.
     clock = count(1)
     methods: dict[str, Callable[..., Results]] = {"NSVQ": step, "plain torch": partial(step, quantize=plain_nsvq)}
     errors = {method: step_errors(attributes, call(attributes, 0)) for method, call in methods.items()}
     steps = {method: lambda call=call: call(attributes, next(clock)) for method, call in methods.items()}
-    workload, move = f"{source.name}, {scope.codebooks} codebooks", lambda: _advance(attributes, next(clock))
-    yield from compare(STEP, workload, steps, errors, scope, prepare=move)
+    yield from compare(
+        STEP,
+        f"{workload.name}, {scope.codebooks} codebooks",
+        steps,
+        errors,
+        scope,
+        prepare=lambda: _advance(attributes, next(clock)),
+    )
 
 
 def prepare(splats: RawSplats, codebooks: str) -> dict[str, Attribute]:
@@ -67,14 +80,15 @@ def prepare(splats: RawSplats, codebooks: str) -> dict[str, Attribute]:
     scene = Splats.from_tensors(*splats)
     shuffled = torch.randperm(len(scene), generator=generator(0, 0, "visible"))
     chosen = shuffled[: int(0.8 * len(scene))].sort().values  # about as many as a camera sees
+    quantizers = build_quantizers(partial(NSVQ, kmeans_steps=1), codebooks, scene)
     prepared = {}
-    for name, module in build_quantizers(lambda k, d: NSVQ(k, d, kmeans_steps=1), codebooks, scene).items():
+    for name, module in quantizers.items():
         quantizer = cast(CodebookQuantizer, module)
-        every = attribute_rows(scene.raw(), name)
-        quantizer.fit(every, generator=generator(0, 0, "fit", name))
-        x = every.clone().requires_grad_()
+        x = attribute_rows(scene.raw(), name).clone()
+        quantizer.fit(x, generator=generator(0, 0, "fit", name))
         upstream = 1e-6 * torch.randn(len(chosen), x.shape[1], generator=generator(0, 0, "upstream", name))
-        prepared[name] = Attribute(quantizer.train(), x, chosen, upstream, getattr(LearningRates(), name))
+        rate = getattr(LearningRates(), name)
+        prepared[name] = Attribute(quantizer.train(), x.requires_grad_(), chosen, upstream, rate)
     return prepared
 
 
@@ -118,17 +132,20 @@ def step_errors(attributes: Mapping[str, Attribute], results: Results) -> dict[s
     """
     lengths, gradients, wrong = [], [], 0.0
     for name, (quantized, gradient, codes) in results.items():
-        quantizer, table, rows, upstream, _ = attributes[name]
-        x, upstream, gradient = table.detach()[rows].double(), upstream.double(), gradient[rows]
-        codebook = quantizer.codebook.detach()
-        residual, offset = x - codebook.double()[codes], quantized.double() - x
-        away, moved = residual.norm(dim=1, keepdim=True), offset.norm(dim=1, keepdim=True)
+        attribute = attributes[name]
+        x = attribute.x.detach()[attribute.rows].double()
+        codebook = attribute.quantizer.codebook.detach()
+        upstream = attribute.upstream.double()
+        residual = x - codebook.double()[codes]
+        offset = quantized.double() - x
+        away = residual.norm(dim=1, keepdim=True)
+        moved = offset.norm(dim=1, keepdim=True)
         along = (upstream * offset).sum(1, keepdim=True) / moved.where(moved > 0, torch.inf)
         expected = upstream + along * residual / away.where(away > 0, torch.inf)
         # A row on its code has no direction of its own.
         clear = (away > 1e-6 * x.norm(dim=1, keepdim=True).clamp_min(1e-12))[:, 0]
         lengths.append(relative_l2(moved, away))
-        gradients.append(relative_l2(gradient[clear], expected[clear]))
+        gradients.append(relative_l2(gradient[attribute.rows][clear], expected[clear]))
         wrong += code_errors(x, codebook, codes)["wrong codes"]
     return {"gradient error": max(gradients), "length error": max(lengths), "wrong codes": wrong}
 
@@ -145,11 +162,12 @@ def code_errors(x: Tensor, codebook: Tensor, codes: Tensor) -> dict[str, float]:
         codebook: ``[K, D]``.
         codes: What was found for them.
     """
-    some = slice(None, None, -(-len(x) // CHECKED_ROWS))
-    x, codebook = x[some].double(), codebook.double()
-    chosen = (nearest_reference(x, codebook), codes[some])
-    least, distance = ((x - codebook[each]).norm(dim=1) for each in chosen)
-    added, total = float((distance - least).clamp_min(0).sum()), float(least.sum())
+    every = math.ceil(len(x) / CHECKED_ROWS)
+    x, codebook, codes = x[::every].double(), codebook.double(), codes[::every]
+    least = (x - codebook[nearest_reference(x, codebook)]).norm(dim=1)
+    distance = (x - codebook[codes]).norm(dim=1)
+    added = float((distance - least).clamp_min(0).sum())
+    total = float(least.sum())
     return {"wrong codes": float((distance > least).sum()), "added distance": added / total if total > 0 else added}
 
 

@@ -12,8 +12,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark import Scope
-from nsvq_lightning.commands.benchmark.timing import Measurement, compare
+from nsvq_lightning.commands.benchmark.timing import Measurement, Scope, compare
 from nsvq_lightning.commands.benchmark.workloads import Workload, relative_l2, workloads
 from nsvq_lightning.compute.devices import devices_with_kernels, fast_backends
 from nsvq_lightning.quality.loss import photometric_loss
@@ -22,7 +21,9 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats
 
-FORWARD, BOTH, LOSS = "forward", "forward + backward", "L1 + D-SSIM, forward + backward"
+FORWARD = "forward"
+BOTH = "forward + backward"
+LOSS = "L1 + D-SSIM, forward + backward"
 
 
 def run(scope: Scope) -> Iterator[Measurement]:
@@ -60,14 +61,22 @@ def _render_rows(workload: Workload, scope: Scope, device: str) -> Iterator[Meas
     while len(crop.splats.means) * crop.camera.width * crop.camera.height > ORACLE_WORK[scope.quick]:
         crop = workload.crop(crop.camera.width // 2, crop.camera.height // 2)
     truth = trace(crop, every["plain torch"], torch.float64)
-    errors = {name: errors_of(crop, paint, truth) for name, paint in every.items()}
     pixels = {"error pixels": float(crop.camera.width * crop.camera.height)}
-    for where, painters in ((workload, fast), (crop, every)) if crop is not workload else ((workload, every),):
+    errors = {}
+    for name, paint in every.items():
+        by_operation = errors_of(crop, paint, truth)
+        errors[name] = {operation: pixels | found for operation, found in by_operation.items()}
+
+    def timed(where: Workload, painters: dict[str, Painter]) -> Iterator[Measurement]:
         leaves = RawSplats(*(tensor.clone().requires_grad_() for tensor in where.splats))
         for operation, call in ((FORWARD, _forward), (BOTH, _both)):
             cases = {name: partial(call, paint, where, leaves) for name, paint in painters.items()}
-            values = {name: pixels | errors[name][operation] for name in painters}
+            values = {name: errors[name][operation] for name in painters}
             yield from compare(operation, str(where), cases, values, scope, device)
+
+    if crop is not workload:
+        yield from timed(workload, fast)
+    yield from timed(crop, every)
 
 
 @torch.no_grad()
@@ -90,8 +99,9 @@ def errors_of(crop: Workload, paint: Painter, truth: Traced) -> dict[str, dict[s
     found = trace(crop, paint, torch.float32)
     image, usual = image_errors(found[0], truth[0])
     weights = crop.image_gradient * usual[..., None]
+    gradients = gradients_of(found, weights)
     expected = gradients_of(truth, weights.double())
-    by_name = {name: relative_l2(value, expected[name]) for name, value in gradients_of(found, weights).items()}
+    by_name = {name: relative_l2(gradient, expected[name]) for name, gradient in gradients.items()}
     return {FORWARD: image, BOTH: {"gradient error": max(by_name.values()), **by_name}}
 
 
@@ -118,7 +128,8 @@ def image_errors(image: Tensor, truth: Tensor) -> tuple[dict[str, float], Tensor
         Errors by name, and ``[H, W]`` bool: the pixels whose error is at most ten times the median of those above 0.
     """
     error = (image.detach().double() - truth.detach()).abs().amax(-1)
-    usual = error <= (10.0 * error[error > 0].median() if bool((error > 0).any()) else 0.0)
+    some = error[error > 0]
+    usual = error <= (10.0 * some.median() if len(some) else 0.0)
     errors = {
         "max error": float(error[usual].max()),
         "mean error": float(error[usual].mean()),
@@ -139,19 +150,22 @@ def _loss_rows(scope: Scope, device: str) -> Iterator[Measurement]:
     # No value is almost right: the gradient of its absolute error would be the sign of a rounding.
     image = (photo / 255 + 0.01 + 0.1 * torch.rand(PHOTO, generator=draw)).to(device)
     photo = photo.to(device)
-    methods: dict[str, Loss] = {f"fused, {device}": photometric_loss, f"plain torch, {device}": plain_loss}
 
     def gradient(loss: Loss, image: Tensor) -> Tensor:
         image = image.detach().requires_grad_()
         return torch.autograd.grad(loss(image, photo, 0.2), image)[0]
 
     truth = gradient(plain_loss, image.double())
-    errors = {name: {"gradient error": relative_l2(gradient(loss, image), truth)} for name, loss in methods.items()}
-    cases = {name: partial(gradient, loss, image) for name, loss in methods.items()}
+    cases = {
+        f"fused, {device}": partial(gradient, photometric_loss, image),
+        f"plain torch, {device}": partial(gradient, plain_loss, image),
+    }
+    errors = {method: {"gradient error": relative_l2(call(), truth)} for method, call in cases.items()}
     yield from compare(LOSS, f"{PHOTO[1]}x{PHOTO[0]}", cases, errors, scope, device)
 
 
 def plain_loss(image: Tensor, photo: Tensor, dssim_weight: float) -> Tensor:
     """(1 - λ)·L1 + λ·(1 - SSIM) of images ``[H, W, 3]`` in plain torch, in the type of the first one."""
     image, photo = in_range(image, photo)
-    return (1 - dssim_weight) * (image - photo).abs().mean() + dssim_weight * (1 - plain_ssim(image, photo))
+    l1 = (image - photo).abs().mean()
+    return (1 - dssim_weight) * l1 + dssim_weight * (1 - plain_ssim(image, photo))

@@ -4,6 +4,7 @@ import gc
 import importlib.metadata
 import os
 import platform
+import re
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -13,11 +14,48 @@ from pathlib import Path
 import torch
 from llvmlite import binding
 
-from nsvq_lightning.commands.benchmark import Scope
 from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.random import generator
 from nsvq_lightning.report.numbers import markdown_table
 from nsvq_lightning.version import __version__
+
+
+@dataclass(frozen=True)
+class Scope:
+    """What is measured, and how thoroughly: what the command line says, with its defaults filled in.
+
+    Attributes:
+        quick: Small workloads and few repeats, for continuous integration.
+        repeats: Timed calls of each case, at least 1.
+        seconds: A case is not called again once its calls have taken this long together.
+        workloads: Names of synthetic scenes of ``render`` and ``codec``.
+        scene: Scene file or COLMAP folder that is measured instead of the synthetic scenes.
+        init_from: Scene file whose splats are seen by the cameras of the COLMAP folder ``scene``, instead of its
+            points.
+        steps: Iterations of each run of ``train``, at least 4: a phase has one at least.
+        switches: Names of :data:`nsvq_lightning.skips.SKIPS` that ``train`` inverts one by one.
+        config: Config of the runs of ``train``; by default ``fast.yaml``, without photos ``demo.yaml``.
+    """
+
+    quick: bool = False
+    repeats: int = 15
+    seconds: float = 5.0
+    workloads: tuple[str, ...] = ("A20k", "B100k", "C500k")
+    scene: Path | None = None
+    init_from: Path | None = None
+    steps: int = 1000
+    switches: tuple[str, ...] = ()
+    config: str | None = None
+
+    @property
+    def photos(self) -> Path | None:
+        """The COLMAP folder, if the scene is one."""
+        return self.scene if self.scene is not None and self.scene.is_dir() else None
+
+    @property
+    def codebooks(self) -> str:
+        """The paper's codebook setting in the suites that quantize."""
+        return "1k" if self.quick else "16k"
 
 
 @dataclass(frozen=True)
@@ -127,16 +165,18 @@ def sgemm(device: str = "cpu") -> Call:
 
 def describe_machine() -> list[str]:
     """A line about the machine and how busy it is, and one with the versions of packages that results depend on."""
+    cpu = platform.processor() or platform.machine()
     # The platform module knows only the architecture of the processor on Linux.
     about = Path("/proc/cpuinfo")
-    lines = about.read_text(encoding="utf-8").splitlines() if about.is_file() else []
-    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    has = binding.get_host_cpu_features()
+    if about.is_file():
+        found = re.search(r"^model name\s*: (.*)", about.read_text(encoding="utf-8"), re.MULTILINE)
+        cpu = found[1] if found else cpu
+    features = binding.get_host_cpu_features()
     notable = ("avx512f", "avx512_bf16", "avx512bf16", "amx-tile", "avx2", "fma", "f16c", "neon", "sve")
     machine = {
-        "cpu": next(models, platform.processor() or platform.machine()),
+        "cpu": cpu,
         "llvm": binding.get_host_cpu_name(),
-        "simd": " ".join(name for name in notable if has.get(name)) or None,
+        "simd": " ".join(name for name in notable if features.get(name)) or None,
         "cores": f"{usable_cores()} of {os.cpu_count()}",
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "system": f"{platform.system()} {platform.machine()}",
@@ -145,10 +185,11 @@ def describe_machine() -> list[str]:
     packages = ("numpy", "torch", "numba", "llvmlite", "lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")
     versions = {"nsvq-lightning": __version__, "python": platform.python_version()}
     versions |= {name: importlib.metadata.version(name) for name in packages}
-    return [
-        ", ".join(f"{name} {value}" for name, value in facts.items() if value is not None)
-        for facts in (machine, versions)
-    ]
+    return [_listed(machine), _listed(versions)]
+
+
+def _listed(facts: Mapping[str, object]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in facts.items() if value is not None)
 
 
 def as_markdown(about: Sequence[str], scope: Scope, suites: Mapping[str, Sequence[Measurement]]) -> str:
@@ -159,25 +200,31 @@ def as_markdown(about: Sequence[str], scope: Scope, suites: Mapping[str, Sequenc
         scope: What was measured, and how thoroughly.
         suites: Measurements by the name of their suite.
     """
+    quick = "; quick" if scope.quick else ""
     parts = [
         "# nsvq benchmark",
         *about,
-        f"Rounds: {scope.repeats}; threads: {torch.get_num_threads()}{'; quick' * scope.quick}. ms: median of the n "
+        f"Rounds: {scope.repeats}; threads: {torch.get_num_threads()}{quick}. ms: median of the n "
         "calls. sgemm: the median as a multiple of a 2048³ float32 matrix product of torch that took turns with it.",
     ]
     for suite, rows in suites.items():
         parts.append(f"## {suite}")
         for operation in dict.fromkeys(row.operation for row in rows):
-            some = [row for row in rows if row.operation == operation]
-            names = list(dict.fromkeys(name for row in some for name in row.values))
-            cells = []
-            for row in some:
-                numbers = [row.median, min(row.samples), len(row.samples), row.ratio]
-                values = [number(row.values[name]) if name in row.values else "" for name in names]
-                cells.append([row.workload, row.method, *map(number, numbers), *values])
-            head = ["workload", "method", "ms", "min", "n", "sgemm", *names]
-            parts += [f"### {operation}", markdown_table(head, cells, words=head[:2])]
+            parts.append(f"### {operation}")
+            parts.append(_table([row for row in rows if row.operation == operation]))
     return "\n\n".join(parts) + "\n"
+
+
+def _table(rows: Sequence[Measurement]) -> str:
+    """Rows of one operation; what only some of them have is empty in the others."""
+    names = list(dict.fromkeys(name for row in rows for name in row.values))
+    cells = []
+    for row in rows:
+        times = [row.median, min(row.samples), len(row.samples), row.ratio]
+        values = [number(row.values[name]) if name in row.values else "" for name in names]
+        cells.append([row.workload, row.method, *map(number, times), *values])
+    words = ["workload", "method"]
+    return markdown_table([*words, "ms", "min", "n", "sgemm", *names], cells, words)
 
 
 def number(value: float) -> str:

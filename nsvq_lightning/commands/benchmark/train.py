@@ -20,9 +20,10 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from nsvq_lightning.commands.arguments import find_config
-from nsvq_lightning.commands.benchmark import Scope, timing
+from nsvq_lightning.commands.benchmark import timing
+from nsvq_lightning.commands.benchmark.timing import Measurement, Scope
 from nsvq_lightning.commands.fit import SplatCLI
+from nsvq_lightning.commands.settings import find_config
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.report.numbers import evaluate
 from nsvq_lightning.training.module import SplatModule
@@ -44,7 +45,8 @@ class StepClock(Callback):
         self.steps: list[tuple[Phase, float]] = []
         self.products: list[float] = []
         self.psnr = 0.0
-        self._product, self._since = timing.sgemm(), 0.0
+        self._product = timing.sgemm()
+        self._since = 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the first step."""
@@ -53,13 +55,23 @@ class StepClock(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *args: Any) -> None:
         """End a step, the work of a GPU included, and start the next; compare the test views after the last."""
         timing.finish()
-        took, module = 1000 * (time.perf_counter() - self._since), cast(SplatModule, pl_module)
+        took = 1000 * (time.perf_counter() - self._since)
+        module = cast(SplatModule, pl_module)
         self.steps.append((module.phase, took))
         if trainer.global_step == trainer.max_steps:
             self.psnr = _test_psnr(module)
         if trainer.global_step % 8 == 1:
             self.products.append(timing.milliseconds(self._product))
         self._since = time.perf_counter()
+
+    @property
+    def by_phase(self) -> dict[str, float]:
+        """The median step of each phase, in ms."""
+        phases = dict.fromkeys(phase for phase, _ in self.steps)
+        return {
+            f"{phase.name.lower()} ms": median(took for its_phase, took in self.steps if its_phase == phase)
+            for phase in phases
+        }
 
     @property
     def relative(self) -> float:
@@ -99,11 +111,14 @@ def _train(scope: Scope, clock: StepClock, options: Sequence[str] = ()) -> dict[
     Returns:
         Everything that was trained, by name.
     """
-    data: tuple[str, ...] = ("--data=ColmapDataModule", f"--data.root={scope.photos}")
-    if scope.photos is None:
-        data = ("--data=DemoDataModule", *(QUICK_DEMO if scope.quick else ()))
+    if scope.photos is not None:
+        data = ["--data=ColmapDataModule", f"--data.root={scope.photos}"]
+    else:
+        data = ["--data=DemoDataModule"]
+        if scope.quick:
+            data += QUICK_DEMO
     if scope.init_from is not None:
-        data += (f"--model.init_from={scope.init_from}",)
+        data.append(f"--model.init_from={scope.init_from}")
     logging.disable(logging.WARNING)  # of Lightning, about devices, loaders and the end of the run
     try:
         with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder, warnings.catch_warnings(action="ignore"):
@@ -128,9 +143,8 @@ def _config(scope: Scope) -> str:
     return scope.config or ("fast.yaml" if scope.photos else "demo.yaml")
 
 
-def run(scope: Scope) -> Iterator[timing.Measurement]:
+def run(scope: Scope) -> Iterator[Measurement]:
     """Train as shipped, and without codebooks or with each inverted switch that is asked for."""
-    rounds = 1 if scope.quick else 2
     variants: dict[str, tuple[str, ...]] = {"as shipped": ()}
     variants |= {f"no skip of {name}": (f"--skips.{name}=false",) for name in scope.switches}
     if not scope.switches:
@@ -138,37 +152,40 @@ def run(scope: Scope) -> Iterator[timing.Measurement]:
     # Not counted, through all phases: kernels are loaded, and compiled where they never were.
     _train(replace(scope, steps=8), StepClock())
     clocks = {name: StepClock() for name in variants}
-    trained: dict[str, dict[str, Tensor]] = {}
+    trained = {}
+    order = list(variants)
+    rounds = 1 if scope.quick else 2
     for turn in range(rounds):
-        order = list(variants)
         for name in order[turn:] + order[:turn]:
             trained[name] = _train(scope, clocks[name], variants[name])
-    shipped, numbers = clocks["as shipped"], trained["as shipped"]
+    shipped = clocks["as shipped"]
     scene = "demo" if scope.photos is None else scope.photos.resolve().name
+    described = f"{scene}, {Path(_config(scope)).name}, {scope.steps} steps"
     for name, clock in clocks.items():
-        by_phase: dict[Phase, list[float]] = {}
-        for phase, took in clock.steps:
-            by_phase.setdefault(phase, []).append(took)
         samples = [took for _, took in clock.steps]
         values = {
             "PSNR dB": clock.psnr,
             "seconds": sum(samples) / 1000 / rounds,
             "times as shipped": clock.relative / shipped.relative,
-            **{f"{phase.name.lower()} ms": median(times) for phase, times in by_phase.items()},
+            **clock.by_phase,
             "splats": float(len(trained[name]["splats.means"])),
-            "other numbers": float(different_numbers(trained[name], numbers)),
+            "other numbers": float(different_numbers(trained[name], trained["as shipped"])),
         }
         if name.startswith("no skip"):
             values["saves %"] = 100 * (1 - shipped.relative / clock.relative)
-        described = f"{scene}, {Path(_config(scope)).name}, {scope.steps} steps"
-        yield timing.Measurement("run", described, name, samples, clock.products, values)
+        yield Measurement("run", described, name, samples, clock.products, values)
 
 
 @torch.no_grad()
 def _test_psnr(module: SplatModule) -> float:
     data: ColmapDataModule = module.trainer.datamodule  # type: ignore[attr-defined]  # Lightning does not type it
-    splats, views = module.scene.hard_splats(module.phase), data.test_dataloader()
-    return evaluate(lambda camera: module.scene.render(splats, camera).image, views, module.device)[0]
+    splats = module.scene.hard_splats(module.phase)
+    psnr, _ = evaluate(
+        lambda camera: module.scene.render(splats, camera).image,
+        data.test_dataloader(),
+        module.device,
+    )
+    return psnr
 
 
 def different_numbers(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> int:

@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nsvq_lightning.commands.benchmark import SIZES, Scope
+from nsvq_lightning.commands.benchmark import SIZES
+from nsvq_lightning.commands.benchmark.timing import Scope
 from nsvq_lightning.compression.viewpoints import look_at, middle_of
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import read_scene
@@ -39,7 +40,8 @@ class Workload:
 
         The pixels are not quite the same: the projection of splats outside a margin around the view is clamped.
         """
-        left, top = (self.camera.width - width) // 2, (self.camera.height - height) // 2
+        left = (self.camera.width - width) // 2
+        top = (self.camera.height - height) // 2
         K = self.camera.K.clone()
         K[0, 2] -= left
         K[1, 2] -= top
@@ -48,9 +50,12 @@ class Workload:
 
     def to(self, device: torch.device | str) -> "Workload":
         """The workload with its splats, background and gradient on a device; the camera stays where it is."""
-        splats = RawSplats(*(tensor.to(device) for tensor in self.splats))
-        background, image_gradient = self.background.to(device), self.image_gradient.to(device)
-        return replace(self, splats=splats, background=background, image_gradient=image_gradient)
+        return replace(
+            self,
+            splats=RawSplats(*(tensor.to(device) for tensor in self.splats)),
+            background=self.background.to(device),
+            image_gradient=self.image_gradient.to(device),
+        )
 
     def __str__(self) -> str:
         return f"{self.name} {self.camera.width}x{self.camera.height}"
@@ -75,20 +80,21 @@ def workloads(scope: Scope) -> list[Workload]:
         FormatError: It is damaged.
         SceneError: The COLMAP folder cannot be used.
     """
-    path, file = scope.scene, scope.scene if scope.photos is None else scope.init_from
-    if path is None:
+    if scope.scene is None:
         return [synthetic_workload(name) for name in scope.workloads]
-    name, scene = path.resolve().name, None if scope.photos is None else load_scene(scope.photos)
-    if file is not None:
-        splats = detached(read_scene(file).decode())
-        name += f" {file.name}" if scene is not None else ""
-    elif scene is not None:
+    name = scope.scene.resolve().name
+    if scope.photos is None:
+        splats = detached(read_scene(scope.scene).decode())
+        centre, reach = middle_of(splats.means.numpy())
+        return [_seen_by(_camera(800, 533, centre, 2 * reach), splats, name)]
+    scene = load_scene(scope.photos)
+    if scope.init_from is not None:
+        splats = detached(read_scene(scope.init_from).decode())
+        name += f" {scope.init_from.name}"
+    else:
         scene = scene.standard
         splats = detached(Splats.from_points(scene.points, scene.colors, sh_degree=3))
-    if scene is not None:
-        return [_seen_by(scene.cameras[scene.train[0]], splats, name)]
-    centre, reach = middle_of(splats.means.numpy())
-    return [_seen_by(_camera(800, 533, centre, 2 * reach), splats, name)]
+    return [_seen_by(scene.cameras[scene.train[0]], splats, name)]
 
 
 SEED = 7
@@ -104,7 +110,8 @@ def synthetic_workload(name: str) -> Workload:
     # One stream, so the order of the draws is part of the definition.
     rng = np.random.default_rng(SEED)
     means = _positions(n, rng)
-    scales = math.log(scale) + rng.normal(size=(n, 1)) * 0.5 + rng.normal(size=(n, 3)) * 0.5
+    scales = math.log(scale) + rng.normal(size=(n, 1)) * 0.5
+    scales = scales + rng.normal(size=(n, 3)) * 0.5
     quats = _directions(rng, n, 4)
     quats *= np.exp(rng.normal(size=(n, 1)) * 0.1)  # as training leaves them: not of unit length
     opacities = rng.normal(size=n) * 1.8 - 0.3
@@ -126,24 +133,26 @@ def _directions(rng: np.random.Generator, count: int, dim: int) -> Float64s:
 
 def _positions(count: int, rng: np.random.Generator) -> Float64s:
     """Positions ``[count, 3]``, shuffled: a sphere, the ground, a box, a loose cloud, a shell of background."""
-    on_sphere, on_ground, on_box, in_cloud = parts = [int(share * count) for share in (0.25, 0.25, 0.10, 0.25)]
-    sphere = _directions(rng, on_sphere, 3) * 0.9 + rng.normal(size=(on_sphere, 3)) * 0.02
-    ground = [rng.uniform(-2.2, 2.2, on_ground), 0.9 + rng.normal(size=on_ground) * 0.02]
-    ground.append(rng.uniform(-2.2, 2.2, on_ground))
-    box = rng.uniform(-0.4, 0.4, (on_box, 3))
-    axis, side = rng.integers(0, 3, on_box), rng.integers(0, 2, on_box) * 2 - 1
-    box[np.arange(on_box), axis] = 0.4 * side
+    quarter, tenth = int(0.25 * count), int(0.10 * count)
+    sphere = _directions(rng, quarter, 3) * 0.9 + rng.normal(size=(quarter, 3)) * 0.02
+    x = rng.uniform(-2.2, 2.2, quarter)
+    y = 0.9 + rng.normal(size=quarter) * 0.02
+    z = rng.uniform(-2.2, 2.2, quarter)
+    ground = np.stack([x, y, z], 1)
+    box = rng.uniform(-0.4, 0.4, (tenth, 3))
+    axis = rng.integers(0, 3, tenth)
+    box[np.arange(tenth), axis] = 0.4 * (rng.integers(0, 2, tenth) * 2 - 1)
     box += np.array([1.3, 0.5, -0.6])
-    cloud = rng.normal(size=(in_cloud, 3)) * 0.8
-    on_shell = count - sum(parts)
-    shell = _directions(rng, on_shell, 3) * rng.uniform(2.5, 3.2, (on_shell, 1))
-    positions = np.concatenate([sphere, np.stack(ground, 1), box, cloud, shell])
+    cloud = rng.normal(size=(quarter, 3)) * 0.8
+    rest = count - 3 * quarter - tenth
+    shell = _directions(rng, rest, 3) * rng.uniform(2.5, 3.2, (rest, 1))
+    positions = np.concatenate([sphere, ground, box, cloud, shell])
     return positions[rng.permutation(count)]
 
 
 def _camera(width: int, height: int, target: Float64s, distance: float) -> Camera:
     """A camera that looks at ``target`` from above and aside, y down."""
-    azimuth, elevation = 0.5, 0.35
+    azimuth, elevation = 0.5, 0.35  # radians
     across = math.cos(elevation)
     direction = np.array([across * math.sin(azimuth), -math.sin(elevation), -across * math.cos(azimuth)])
     return look_at(target, target + distance * direction, width, height, math.radians(60.0))

@@ -7,8 +7,8 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from nsvq_lightning.commands.benchmark import Scope, timing
-from nsvq_lightning.commands.benchmark.timing import Call, Measurement, as_markdown, compare, number
+from nsvq_lightning.commands.benchmark import timing
+from nsvq_lightning.commands.benchmark.timing import Call, Measurement, Scope, as_markdown, compare, number
 
 
 @pytest.fixture(autouse=True)

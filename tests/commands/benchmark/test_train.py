@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from nsvq_lightning import save
-from nsvq_lightning.commands.benchmark import Scope, codec, quantize, render, timing, train
-from nsvq_lightning.commands.benchmark.timing import Measurement
+from nsvq_lightning.commands.benchmark import codec, quantize, render, timing, train
+from nsvq_lightning.commands.benchmark.timing import Measurement, Scope
 from nsvq_lightning.commands.benchmark.workloads import synthetic_workload
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.splats import RawSplats

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nsvq_lightning import save
-from nsvq_lightning.commands.benchmark import Scope
+from nsvq_lightning.commands.benchmark.timing import Scope
 from nsvq_lightning.commands.benchmark.workloads import relative_l2, synthetic_workload, workloads
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import CompressedScene, write_ply

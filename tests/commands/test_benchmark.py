@@ -8,7 +8,7 @@ from nsvq_lightning.commands.benchmark import SUITES, render, timing
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.skips import SKIPS
 
-DOCS = Path(__file__).resolve().parents[3] / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 def test_results_are_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,253 @@
+"""Settings of ``nsvq fit`` as they are typed: configs by name, short options, and what is refused without Lightning."""
+
+import argparse
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from importlib.metadata import version
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nsvq_lightning.commands import nearest
+from nsvq_lightning.data import NO_FOLDER
+from nsvq_lightning.top_level import folder_of
+
+if TYPE_CHECKING:
+    from yaml.nodes import Node
+
+CONFIG = "--config="
+BUDGET = "--callbacks.budget"
+
+# Short options of ``fit``. The first three are numbers of :class:`nsvq_lightning.callbacks.SplatBudget`, of which one
+# holds.
+SHORTHANDS: dict[str, str] = {
+    "quality": "Splats, as a multiple of the default for the photos; more look better and take more bytes and time",
+    "splats": "Splats of the scene, instead of --quality",
+    "bytes": "Size of the file, instead of --quality",
+    "minutes": "Time to train on this machine, without evaluations: as many iterations as measured steps allow",
+}
+
+
+def joined(arguments: Sequence[str]) -> list[str]:
+    """The arguments, each option together with its value (``--a=1`` for ``--a 1``), ``-c`` as ``--config``."""
+    found: list[str] = []
+    for argument in arguments:
+        option = re.sub(r"^-c(?==|$)", "--config", argument)
+        waits = found and found[-1].startswith("--") and "=" not in found[-1] and found[-1] != "--help"
+        if waits and not option.startswith("--"):
+            found[-1] += f"={option}"
+        else:
+            found.append(option)
+    return found
+
+
+def expand(arguments: Sequence[str]) -> list[str]:
+    """The joined arguments, configs that are no files as paths of shipped ones, shorthands as what they stand for.
+
+    That is their own number, and none of the others. Configs come before options, which hold whatever they say.
+
+    Raises:
+        ValueError: Two shorthands are given, of which only one can hold, or one without its number.
+    """
+    expanded = []
+    size: str | None = None  # the shorthand that says how large the scene is to be
+    for argument in joined(arguments):
+        option, _, value = argument.partition("=")
+        name = option.removeprefix("--")
+        if argument.startswith(CONFIG):
+            expanded.append(CONFIG + find_config(value))
+        elif not option.startswith("--") or name not in SHORTHANDS:
+            expanded.append(argument)
+        elif name != "minutes" and size not in (None, name):
+            raise ValueError(f"--{size} and --{name} both say how large the scene is to be: give one of them")
+        elif not value:
+            raise ValueError(f"{option} needs a number")
+        elif name == "minutes":
+            expanded.append(f"--callbacks.phases.minutes={value}")
+        else:
+            size = name
+            expanded.append(f"{BUDGET}.{name}={value}")
+            expanded += [f"{BUDGET}.{other}=null" for other in ("splats", "bytes") if other != name]
+    # An option holds whatever a config says, also one that stands after it.
+    return sorted(expanded, key=lambda each: (each.startswith("--"), not each.startswith(CONFIG)))
+
+
+# What ``nsvq fit --help`` prints without Lightning, whose import takes seconds; a test compares it with its parser.
+FIT_HELP = Path(__file__).with_name("fit_help.txt")
+# Whose options are in it; another version may have others, which its parser knows.
+FIT_HELP_OF = {"lightning": "2.6.6", "jsonargparse": "4.53.0"}
+
+
+def check_early(arguments: Sequence[str]) -> None:
+    """Refuse what takes no import of Lightning to refuse: configs and scenes that do not exist, and options of ``fit``.
+
+    Args:
+        arguments: Expanded ones, after the command.
+
+    Raises:
+        argparse.ArgumentError: There is no such config, or no such option.
+        FileNotFoundError: There is no such scene folder.
+        ValueError: A config cannot be read, or the folder says nothing of cameras.
+    """
+    command, *options = arguments
+    configs = configs_among(arguments)
+    for config in configs:
+        if not Path(config).is_file():
+            shipped = sorted(path.stem for path in folder_of("configs").glob("*.yaml"))
+            meant = f"{nearest(Path(config).stem, shipped)}\nShipped ones: {', '.join(shipped)}"
+            raise argparse.ArgumentError(None, f"there is no config {config}{meant}")
+    own = values_by_name(options)
+    given = values_by_name(settings_of(configs)) | own
+    asks = any(name == "print_config" or name.endswith("help") for name in given)
+    root = given.get("data.root")
+    folder = Path(root or "").expanduser()
+    if not folder.exists() and not asks:
+        raise FileNotFoundError(NO_FOLDER.format(root))
+    if command != "fit":
+        return
+    other_data = not {"data", "data.class_path"}.isdisjoint(given)
+    _check_options(options, own, other_data)
+    if asks or other_data:
+        return
+    if root is None:
+        raise argparse.ArgumentError(None, "which scene? Name its folder: --data.root=path/to/scene")
+    from nsvq_lightning.data import colmap
+
+    if "data.model" not in given and not any(folder.glob("transforms*.json")):
+        colmap.model_files(folder)
+
+
+def _check_options(options: Sequence[str], own: Mapping[str, str], other_data: bool) -> None:
+    """Refuse options that ``fit`` does not have."""
+    stray = [option for option in options if not option.startswith("--")]
+    if stray:
+        place = next((option for option in stray if Path(option).exists()), "path/to/scene")
+        raise argparse.ArgumentError(None, f"{stray[0]} is no option; the scene folder is --data.root={place}")
+    if any(version(name) != known for name, known in FIT_HELP_OF.items()):
+        return  # options of another version are known to its parser only
+    listed = re.findall(r"--([\w.]+)", FIT_HELP.read_text(encoding="utf-8"))
+    known = {name for name in listed if not name.endswith(".help")}
+    # So are those of a class that an option names.
+    classes = known.difference(name.rpartition(".")[0] for name in known)
+    if other_data:
+        classes.add("data")
+    nested = tuple(f"{name}." for name in classes)
+    for name, value in own.items():
+        is_short = any(each.startswith(name) for each in known)
+        if is_short or name.startswith(nested) or name.endswith((".help", ".class_path")):
+            continue
+        meant = nearest(f"--{name}", (f"--{each}" for each in known))
+        if value and Path(value).is_dir():
+            meant = f"; the scene folder is --data.root={value}"
+        raise argparse.ArgumentError(None, f"there is no option --{name}{meant}")
+
+
+def find_config(name: str) -> str:
+    """Path of a config: a given file, otherwise one shipped with the package (``paper``, ``configs/paper.yaml``).
+
+    A name that is neither is returned unchanged, for the parser to report.
+    """
+    plain = Path(name).as_posix().removeprefix("configs/")
+    shipped = folder_of("configs") / plain
+    for path in (Path(name), shipped, shipped.with_name(f"{shipped.name}.yaml")):
+        if path.is_file():
+            return str(path)
+    return name
+
+
+def configs_among(arguments: Iterable[str]) -> list[str]:
+    """The values of ``--config`` among joined arguments."""
+    return [argument.removeprefix(CONFIG) for argument in arguments if argument.startswith(CONFIG)]
+
+
+def settings_of(configs: Iterable[str]) -> Iterator[str]:
+    """What configs set, each value as the option ``--a.b=value``.
+
+    Raises:
+        ValueError: One cannot be read, see :func:`check_config`.
+    """
+    for config in configs:
+        yield from _as_options(check_config(config), "--")
+
+
+def _as_options(settings: Mapping[str, Any], prefix: str) -> Iterator[str]:
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from _as_options(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}={value}"
+
+
+def values_by_name(options: Iterable[str]) -> dict[str, str]:
+    """The value of each option by its name, without dashes and what only a config spells out."""
+    values = {}
+    for option in options:
+        name, _, value = option.partition("=")
+        values[name.removeprefix("--").removesuffix("+").replace(".init_args", "")] = value
+    return values
+
+
+# Of a config, and of its values with every alias written out; that of a run has 6 kB and 500 values.
+MAX_BYTES = 1 << 17
+MAX_VALUES = 100_000
+
+
+def check_config(path: str) -> dict[str, Any]:
+    """Settings of a config, none where the name is not that of a file, which the parser reports.
+
+    Raises:
+        ValueError: It is not text, not YAML, too large, or not a table of settings.
+    """
+    import yaml
+
+    file = Path(path)
+    if not file.is_file():
+        return {}
+    size = file.stat().st_size
+    if size > MAX_BYTES:
+        raise ValueError(f"config {path} has {size} bytes, more than {MAX_BYTES}: give another file")
+    try:
+        # Not the parser's loader: what is nested too deep would overflow its stack.
+        loader = yaml.SafeLoader(file.read_text(encoding="utf-8"))
+        node = _limited(loader.get_single_node())
+        settings = None if node is None else loader.construct_document(node)
+    except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error
+    if not isinstance(settings, dict):
+        found = "nothing" if settings is None else type(settings).__name__
+        raise ValueError(f"config {path} holds {found}: give settings by name, like 'trainer: {{max_steps: 1000}}'")
+    return settings
+
+
+@cache  # otherwise, each call would wrap the loader once more
+def limit_aliases() -> None:
+    """Let the parser refuse what aliases make too large, in files that a config names and in its texts, too."""
+    from jsonargparse._loaders_dumpers import get_yaml_default_loader  # all of its ways to read YAML use this class
+
+    loader: Any = get_yaml_default_loader()  # type: ignore[no-untyped-call]
+    compose = loader.get_single_node
+    loader.get_single_node = lambda self: _limited(compose(self))
+
+
+def _limited(node: "Node | None") -> "Node | None":
+    """A document of YAML, unless it has more values than a config."""
+    import yaml
+
+    if node is not None and _values(node, {}) > MAX_VALUES:
+        raise yaml.YAMLError(f"more than {MAX_VALUES} values by aliases (*name)")
+    return node
+
+
+def _values(node: "Node", known: dict[int, float]) -> float:
+    """Number of values in a node of YAML with all its aliases written out; infinite for one that holds itself."""
+    if id(node) not in known:
+        known[id(node)] = math.inf
+        parts: Iterable[Node] = ()
+        if node.id == "sequence":
+            parts = node.value
+        elif node.id == "mapping":
+            parts = chain.from_iterable(node.value)
+        known[id(node)] = 1 + sum(_values(part, known) for part in parts)
+    return known[id(node)]
