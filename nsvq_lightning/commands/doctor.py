@@ -14,7 +14,6 @@ import os
 import platform
 import re
 import shutil
-import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -25,7 +24,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from nsvq_lightning.commands import settings as given
+from nsvq_lightning.commands import say
+from nsvq_lightning.commands.settings import check_config, find_config
 
 # Each check imports what it needs: --help answers at once, and a package that is missing or broken fails only the
 # checks that need it.
@@ -48,7 +48,7 @@ def run(options: argparse.Namespace) -> int:
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
     counts = shown(check_all(options.folder))
     problems, notes = counts["problem"], counts["note"]
-    sys.stdout.write(f"\n{problems or 'no'} problem{'s' * (problems != 1)}, {notes or 'no'} note{'s' * (notes != 1)}\n")
+    say(f"\n{problems or 'no'} problem{'s' * (problems != 1)}, {notes or 'no'} note{'s' * (notes != 1)}")
     return 1 if problems else 0
 
 
@@ -56,17 +56,18 @@ def shown(findings: "Iterator[Finding]") -> Counter[str]:
     """Print findings as they come, since each check takes seconds; returns how many there are of each verdict."""
     counts: Counter[str] = Counter()
     for finding in findings:
-        sys.stdout.write(f"{finding}\n")
+        say(str(finding))
         counts[finding.verdict] += 1
     return counts
 
 
 def check_all(folder: Path | None) -> "Iterator[Finding]":
     """All findings about this machine and, if given, a scene folder."""
-    checks = {"machine": check_machine(), "packages": check_packages(), "threads": check_threads()}
-    checks |= {"memory": check_room(Path()), "self-test": check_backends()}
-    for subject, check in checks.items():
-        yield from attempt(subject, check)
+    yield from attempt("machine", check_machine())
+    yield from attempt("packages", check_packages())
+    yield from attempt("threads", check_threads())
+    yield from attempt("memory", check_room(Path()))
+    yield from attempt("self-test", check_backends())
     if folder is not None:
         yield from check_folder(folder)
 
@@ -88,10 +89,9 @@ class Finding(NamedTuple):
         return f"{self.verdict:<8} {self.subject:<12} {self.text}"
 
 
-def judged(subject: str, text: str, *advice: str | Literal[False]) -> Finding:
-    """A note with the first advice that is given, ``condition and "advice"``; good if there is none."""
-    said = next(filter(None, advice), None)
-    return Finding("note" if said else "good", subject, f"{text}: {said}" if said else text)
+def judged(subject: str, text: str, advice: str, *, when: bool) -> Finding:
+    """A note with the advice when something is not as it should be, otherwise good."""
+    return Finding("note", subject, f"{text}: {advice}") if when else Finding("good", subject, text)
 
 
 def attempt(subject: str, check: Iterator[Finding]) -> Iterator[Finding]:
@@ -113,12 +113,14 @@ def check_machine() -> Iterator[Finding]:
     from nsvq_lightning.compute.devices import best_device
 
     machine, versions = timing.describe_machine()
-    built = torch.version.cuda or torch.version.hip
-    advice = "check nvidia-smi and CUDA_VISIBLE_DEVICES" if built else "for an NVIDIA GPU install a CUDA build"
-    none = not (torch.cuda.is_available() or torch.backends.mps.is_available()) and f"torch finds no GPU: {advice}"
-    idle = best_device().type == "cpu" and "runs use the CPU, as its GPU has no kernels here (NVIDIA's on Linux have)"
-    yield judged("machine", machine, none, idle)
-    yield judged("versions", versions)
+    if torch.cuda.is_available() or torch.backends.mps.is_available():
+        advice = "runs use the CPU, as its GPU has no kernels here (NVIDIA's on Linux have)"
+    elif torch.version.cuda or torch.version.hip:
+        advice = "torch finds no GPU: check nvidia-smi and CUDA_VISIBLE_DEVICES"
+    else:
+        advice = "torch finds no GPU: for an NVIDIA GPU install a CUDA build"
+    yield judged("machine", machine, advice, when=best_device().type == "cpu")
+    yield Finding("good", "versions", versions)
 
 
 OPENCV = "opencv-contrib-python-headless"
@@ -126,15 +128,15 @@ OPENCV = "opencv-contrib-python-headless"
 
 def check_packages() -> Iterator[Finding]:
     """OpenCV, once: several packages overwrite each other's files."""
-    packages = sorted(set(packages_distributions().get("cv2", ())))
     try:
         import cv2
     except ImportError as error:
         yield Finding("problem", "opencv", f"cannot be loaded ({error}): pip install {OPENCV}")
-    else:
-        text = f"{cv2.__version__} ({' and '.join(packages) or 'not from pip'})"
-        advice = f"they overwrite each other's files; uninstall all of them, then pip install {OPENCV}"
-        yield judged("opencv", text, len(packages) > 1 and advice)
+        return
+    packages = sorted(set(packages_distributions().get("cv2", ())))
+    text = f"{cv2.__version__} ({' and '.join(packages) or 'not from pip'})"
+    advice = f"they overwrite each other's files; uninstall all of them, then pip install {OPENCV}"
+    yield judged("opencv", text, advice, when=len(packages) > 1)
 
 
 def check_threads() -> Iterator[Finding]:
@@ -145,32 +147,35 @@ def check_threads() -> Iterator[Finding]:
     from nsvq_lightning.compute.environment import usable_cores
     from nsvq_lightning.compute.jit import thread_count
 
-    cores, used = usable_cores(), thread_count()
+    cores = usable_cores()
+    used = thread_count()
     told = {"OMP_NUM_THREADS", "NUMBA_NUM_THREADS"} & os.environ.keys()
     # On a Mac, torch spares the slow cores, which would hold up the others.
-    spared = used < cores and not told and (platform.system(), platform.machine()) == ("Darwin", "arm64")
+    is_mac = (platform.system(), platform.machine()) == ("Darwin", "arm64")
+    spared = used < cores and not told and is_mac
     text = f"{used} used of {cores} cores (torch {torch.get_num_threads()}, numba {numba.config.NUMBA_NUM_THREADS})"
     advice = f"as many as cores are fastest; unset OMP_NUM_THREADS and NUMBA_NUM_THREADS, or set them to {cores}"
-    yield judged("threads", text, used != cores and not spared and advice)
+    yield judged("threads", text, advice, when=used != cores and not spared)
     policy = os.environ.get("OMP_WAIT_POLICY", "not set")
     advice = "on a shared machine threads that wait by spinning slow a step down several times; set it to passive"
-    yield judged("waiting", f"OMP_WAIT_POLICY is {policy}", policy.lower() != "passive" and advice)
+    yield judged("waiting", f"OMP_WAIT_POLICY is {policy}", advice, when=policy.lower() != "passive")
 
 
 # Bytes; less may not hold checkpoints and report.
-SMALL_DISK = 2 << 30
+MIN_DISK = 2 << 30
 
 
 def check_room(folder: Path) -> Iterator[Finding]:
     """Memory for a run, and disk space for checkpoints, report and exports where runs are written."""
-    free, disk = available_memory(), shutil.disk_usage(folder).free
+    free = available_memory()
     text = "not told by this system" if free is None else f"{readable_bytes(free)} available"
     advice = "a usual run takes 2 to 4 GB; end programs, or try --data.max_width 800 --data.cache_bytes 500000000"
-    yield judged("memory", text, free is not None and free < 4 << 30 and advice)
+    yield judged("memory", text, advice, when=free is not None and free < 4 << 30)
+    disk = shutil.disk_usage(folder).free
     writable = os.access(folder, os.W_OK)
     text = f"{readable_bytes(disk)} free in {folder.resolve()}{'' if writable else ', which is read-only'}"
     advice = "checkpoints of a run take about 1 GB; see --trainer.default_root_dir"
-    yield judged("disk", text, (disk < SMALL_DISK or not writable) and advice)
+    yield judged("disk", text, advice, when=disk < MIN_DISK or not writable)
 
 
 def check_backends() -> Iterator[Finding]:
@@ -183,10 +188,10 @@ def check_backends() -> Iterator[Finding]:
         for backend, errors in kernel_errors(device).items():
             text = f"{backend}: relative errors against float64: {written(errors)}"
             if all(error < TOLERANCE for error in errors.values()):
-                yield judged("self-test", text)
-            else:
-                advice = f"do not trust a run; remove {kernel_folder()}, and if that does not help report it with "
-                yield Finding("problem", "self-test", f"{text}: {advice}what nsvq doctor says")
+                yield Finding("good", "self-test", text)
+                continue
+            advice = f"do not trust a run; remove {kernel_folder()}, and if that does not help report it with "
+            yield Finding("problem", "self-test", f"{text}: {advice}what nsvq doctor says")
 
 
 def check_folder(root: Path) -> Iterator[Finding]:
@@ -216,32 +221,39 @@ def check_cameras(model: "ColmapModel") -> Iterator[Finding]:
     text = f"{len(cameras)} of {'/'.join(names)}, {_range(sizes)}, for {len(model.images)} registered photos"
     many = model.source == "COLMAP" and len(cameras) > max(1, len(model.images) // 2) and len(sizes) <= 2
     advice = "more exact if one lens took them and COLMAP knows it (--ImageReader.single_camera 1)"
-    yield judged("cameras", text, many and advice)
+    yield judged("cameras", text, advice, when=many)
 
 
 def _range(sizes: Sequence[tuple[int, int]]) -> str:
-    return " to ".join(f"{width}x{height}" for width, height in dict.fromkeys((min(sizes), max(sizes))))
+    ends = dict.fromkeys((min(sizes), max(sizes)))
+    return " to ".join(f"{width}x{height}" for width, height in ends)
 
 
 def check_points(model: "ColmapModel") -> Iterator[Finding]:
     """Number of points, and outliers."""
-    count, finite = len(model.points), model.points[np.isfinite(model.points).all(1)]
+    count = len(model.points)
     if not count:
         text = f"none in {model.source}: random ones take their place, and training has more to do"
         advice = "name a point cloud (ply_file_path in the file), or run COLMAP"
-        yield judged("points", text, not model.synthetic and advice)
-    elif not len(finite):
+        yield judged("points", text, advice, when=not model.synthetic)
+        return
+    finite = model.points[np.isfinite(model.points).all(1)]
+    if not len(finite):
         program = "COLMAP" if model.source == "COLMAP" else "the export"
         yield Finding("problem", "points", f"none is finite: run {program} again")
+        return
+    distances = np.linalg.norm(finite - np.median(finite, axis=0), axis=1)
+    # Ten times farther from the median than four fifths of the points.
+    usual = max(float(np.quantile(distances, 0.8)), 1e-12)
+    far = float(np.mean(distances > 10.0 * usual))
+    text = f"{count:,}, {100 * far:.2g} % far outliers"
+    if len(finite) < count:
+        text += f", {count - len(finite)} not finite (left out)"
+    if count < 1000:
+        advice = "few to start from; take more photos with more overlap, or match more features"
     else:
-        distances = np.linalg.norm(finite - np.median(finite, axis=0), axis=1)
-        # Ten times farther from the median than four fifths of the points.
-        far = float(np.mean(distances > 10.0 * max(float(np.quantile(distances, 0.8)), 1e-12)))
-        lost = count - len(finite)
-        text = f"{count:,}, {100 * far:.2g} % far outliers{f', {lost} not finite (left out)' if lost else ''}"
-        few = count < 1000 and "few to start from; take more photos with more overlap, or match more features"
-        spread = far > 0.02 and "they become floaters; filter them with `colmap point_filtering`"
-        yield judged("points", text, few, spread)
+        advice = "they become floaters; filter them with `colmap point_filtering`"
+    yield judged("points", text, advice, when=count < 1000 or far > 0.02)
 
 
 def check_overlap(model: "ColmapModel") -> Iterator[Finding]:
@@ -249,22 +261,29 @@ def check_overlap(model: "ColmapModel") -> Iterator[Finding]:
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    pairs, names = model.observations, [image.name for image in model.images]
+    pairs = model.observations
     if pairs is None or not len(pairs):
-        yield judged("overlap", f"{model.source} has no observations", "how far views overlap is unknown")
+        text = f"{model.source} has no observations: how far views overlap is unknown"
+        yield Finding("note", "overlap", text)
         return
+    names = [image.name for image in model.images]
     seen = csr_array((np.ones(len(pairs), np.int64), pairs.T), shape=(len(model.points), len(names)))
     common = (seen.T @ seen).toarray()  # points that two views both saw [V, V]; on the diagonal, those of one view
     own = np.maximum(common.diagonal(), 1)
     np.fill_diagonal(common, 0)
     best = common.max(axis=1) / own
     groups, group_of = connected_components(common >= 15, directed=False)
-    weak = np.flatnonzero(group_of != np.bincount(group_of).argmax() if groups > 1 else best < 0.3)
-    named = ", ".join(names[i] for i in weak[:3]) + (f" and {len(weak) - 3} more" if len(weak) > 3 else "")
-    usual, least = float(np.median(best)), float(best.min())
-    text = f"a photo shares {100 * usual:.0f} % of its points with its best partner, at least {100 * least:.0f} %"
-    apart = groups > 1 and f"under 15 with the rest for {named}; take photos between them, or leave them out"
-    yield judged("overlap", text, apart, len(weak) > 0 and f"little for {named}; take photos in between")
+    apart = group_of != np.bincount(group_of).argmax()
+    weak = np.flatnonzero(apart if groups > 1 else best < 0.3)
+    named = ", ".join(names[i] for i in weak[:3])
+    if len(weak) > 3:
+        named += f" and {len(weak) - 3} more"
+    usual, least = 100 * float(np.median(best)), 100 * float(best.min())
+    text = f"a photo shares {usual:.0f} % of its points with its best partner, at least {least:.0f} %"
+    advice = f"little for {named}; take photos in between"
+    if groups > 1:
+        advice = f"under 15 with the rest for {named}; take photos between them, or leave them out"
+    yield judged("overlap", text, advice, when=len(weak) > 0)
 
 
 def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
@@ -275,7 +294,7 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
     train, test = len(scene.train), len(scene.test)
     text = f"{train} train and {test} test photos ({scene.split})"
     advice = "few; what lies between them is guessed, and the test score says little; take more photos"
-    yield judged("split", text, train < 20 and advice)
+    yield judged("split", text, advice, when=train < 20)
     if not scene.extent > 0:
         yield Finding("problem", "extent", f"all train photos {ONE_PLACE}")
     yield from attempt("sizes", check_sizes(scene, model))
@@ -288,7 +307,8 @@ def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     from nsvq_lightning.data.images import same_shape
     from nsvq_lightning.data.scene import OTHER_SHAPE
 
-    sources, scaled, others = scene.images.sources, 0, 0
+    sources = scene.images.sources
+    scaled = others = 0
     for image, source in zip(model.images, sources, strict=True):
         camera = model.cameras[image.camera_id]
         size = camera.width, camera.height
@@ -299,7 +319,7 @@ def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     if others:
         yield Finding("problem", "sizes", f"{text}{OTHER_SHAPE}")
     else:
-        yield judged("sizes", f"{text}are scaled from what {model.source} says, their cameras with them")
+        yield Finding("good", "sizes", f"{text}are scaled from what {model.source} says, their cameras with them")
 
 
 def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
@@ -307,29 +327,31 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     from nsvq_lightning.data.reconstruct import PHOTOS
     from nsvq_lightning.data.scene import each_photo
 
-    masks = each_photo(scene, lambda picture: 1.0 if picture.mask is None else float(picture.mask.float().mean()))
-    count, broken = len(scene), [found for found in masks if not isinstance(found, float)]
-    if broken:
-        yield Finding("problem", "photos", f"{len(broken)} of {count} cannot be used; first: {broken[0]}")
+    # Share of the pixels that count, or what is wrong.
+    found = each_photo(scene, lambda photo: 1.0 if photo.mask is None else float(photo.mask.float().mean()))
+    shares = {name: share for name, share in zip(scene.names, found, strict=True) if isinstance(share, float)}
+    count = len(scene)
+    if len(shares) < count:
+        first = next(each for each in found if not isinstance(each, float))
+        yield Finding("problem", "photos", f"{count - len(shares)} of {count} cannot be used; first: {first}")
     else:
-        yield judged("photos", f"all {count} registered photos can be read")
-    shares = zip(scene.names, masks, strict=True)
-    masked = {name: found for name, found in shares if isinstance(found, float) and found < 1}
+        yield Finding("good", "photos", f"all {count} registered photos can be read")
+    masked = {name: share for name, share in shares.items() if share < 1}
     if masked:
-        share = 1 - sum(masked.values()) / len(masked)
-        text = f"{len(masked)} of {count} photos have pixels that do not count, {100 * share:.0f} % of them"
+        left_out = 1 - sum(masked.values()) / len(masked)
+        text = f"{len(masked)} of {count} photos have pixels that do not count, {100 * left_out:.0f} % of them"
         most = min(masked, key=lambda name: masked[name])
         advice = f"most in {most}; masks are white where the photo counts; if not, invert them"
-        yield judged("masks", text, share > 0.7 and advice)
+        yield judged("masks", text, advice, when=left_out > 0.7)
     folder = scene.root / (model.images_folder or "images")
-    known = {source.path for source in scene.images.sources}
-    # The folder of a NeRF-synthetic scene also holds maps and further views.
-    found = folder.rglob("*") if folder != scene.root else ()
-    files = [path for path in found if path.suffix.lower() in PHOTOS]
-    extra = [path for path in files if path not in known]
+    if folder == scene.root:
+        return  # that of a NeRF-synthetic scene, which also holds maps and further views
+    files = {path for path in folder.rglob("*") if path.suffix.lower() in PHOTOS}
+    extra = files.difference(source.path for source in scene.images.sources)
     if extra:
         text = f"{len(extra)} of {len(files)} files in {folder} are not in the model"
-        yield judged("registered", text, "they are not used; if many, photos lack overlap or sharpness")
+        advice = "they are not used; if many, photos lack overlap or sharpness"
+        yield Finding("note", "registered", f"{text}: {advice}")
 
 
 # Default of ``--data.cache_bytes``.
@@ -344,31 +366,37 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
     from nsvq_lightning.compute.devices import best_device
     from nsvq_lightning.data.scene import detailed_pixels
 
-    fast, whole = (given.check_config(given.find_config(name)) for name in ("fast", "paper"))
-    phases, wanted = PhaseSchedule(**fast["callbacks"]["phases"]), SplatBudget(**fast["callbacks"]["budget"])
-    default, growth = splats_for_photos(len(scene.train), detailed_pixels(scene)), BudgetedGrowth()
-    budget, paper = round(wanted.quality * default), round(PAPER_SPLATS * default)
-    photos, free = scene.images.nbytes, available_memory()
-    needed = 1.2e9 + min(photos, CACHE_BYTES)  # Python, torch, Lightning, compiled kernels and evaluations
+    fast = check_config(find_config("fast"))
+    phases = PhaseSchedule(**fast["callbacks"]["phases"])
+    wanted = SplatBudget(**fast["callbacks"]["budget"])
+    growth = BudgetedGrowth()
+    default = splats_for_photos(len(scene.train), detailed_pixels(scene))
+    budget = round(wanted.quality * default)
+    paper = round(PAPER_SPLATS * default)
+    photos = scene.images.nbytes
+    kept = min(photos, CACHE_BYTES)
+    needed = 1.2e9 + kept  # Python, torch, Lightning, compiled kernels and evaluations
     needed += 59 * 4 * 6 * paper  # float32 of a splat, each with gradient, two moments, and copies while editing
     # Buffers of the renderer, the loss and the picture itself.
     needed += 100 * max(camera.width * camera.height for camera in scene.cameras)
-    shown = readable_bytes(min(photos, CACHE_BYTES))
-    text = f"about {readable_bytes(needed)} with {paper:,} splats and {shown} of photos"
+    text = f"about {readable_bytes(needed)} with {paper:,} splats and {readable_bytes(kept)} of photos"
     if photos > CACHE_BYTES:
         text += f" (all would take {readable_bytes(photos)}; the others are decoded each time)"
+    free = available_memory()
     advice = f"{readable_bytes(free or 0)} are available; lower --data.max_width or --data.cache_bytes"
-    yield judged("run memory", text, free is not None and needed > free and advice)
+    yield judged("run memory", text, advice, when=free is not None and needed > free)
     steps = phases.limited(fast["trainer"]["max_steps"], len(scene.train))
-    all_steps, device = whole["trainer"]["max_steps"], best_device()
+    paper_steps = check_config(find_config("paper"))["trainer"]["max_steps"]
     parts = growth.stretches(phases.schedule(steps), round(wanted.start * budget), budget)
     recipes = tqdm([parts, [(1.0, paper)]], "timing steps of training", leave=False, disable=None)
-    step, paper_step = (iteration_seconds(scene, each, device) for each in recipes)
+    step, paper_step = (iteration_seconds(scene, each, best_device()) for each in recipes)
     most = round(growth.overshoot * budget)
-    text = f"about {steps * step / 60:.0f} min for fast.yaml ({steps:,} steps, up to {most:,} splats), "
-    text += f"{all_steps * paper_step / 3600:.1f} h for the paper's run ({all_steps:,}, {paper:,}), "
-    text += "on a machine as busy as now"
-    yield judged("run time", text)
+    text = (
+        f"about {steps * step / 60:.0f} min for fast.yaml ({steps:,} steps, up to {most:,} splats), "
+        f"{paper_steps * paper_step / 3600:.1f} h for the paper's run ({paper_steps:,}, {paper:,}), "
+        "on a machine as busy as now"
+    )
+    yield Finding("good", "run time", text)
 
 
 def readable_bytes(count: float) -> str:
@@ -381,9 +409,11 @@ def available_memory() -> int | None:
     limits = []
     with suppress(OSError):
         found = re.search(r"^MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text(encoding="ascii"), re.MULTILINE)
-        limits += [1024 * int(found[1])] if found else []
+        if found:
+            limits.append(1024 * int(found[1]))
     group = Path("/sys/fs/cgroup")
     with suppress(OSError, ValueError):  # "max" is no number, and no limit
-        limit, used = (int((group / name).read_text(encoding="ascii")) for name in ("memory.max", "memory.current"))
+        limit = int((group / "memory.max").read_text(encoding="ascii"))
+        used = int((group / "memory.current").read_text(encoding="ascii"))
         limits.append(max(0, limit - used))  # usage includes page cache, which is reclaimable
     return min(limits, default=None)

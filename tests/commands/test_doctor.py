@@ -115,7 +115,7 @@ def test_one_opencv_of_any_name_is_wanted(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_little_memory_and_disk_are_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "available_memory", lambda: 10**9)
-    monkeypatch.setattr(doctor, "SMALL_DISK", 1 << 70)
+    monkeypatch.setattr(doctor, "MIN_DISK", 1 << 70)
     assert [finding.verdict for finding in doctor.check_room(tmp_path)] == ["note", "note"]
 
 
