@@ -14,7 +14,9 @@ import argparse
 import re
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import positive, views_of
 from nsvq_lightning.compression.setting import Setting, setting_for
 from nsvq_lightning.io.atomic import write_bytes
@@ -22,6 +24,15 @@ from nsvq_lightning.io.formats import FORMATS
 from nsvq_lightning.io.lod import NAME
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
 from nsvq_lightning.splats.attributes import SIZES
+
+if TYPE_CHECKING:
+    from nsvq_lightning.compression.viewpoints import Measure
+
+DEFAULT_SIZE = "16k"
+MINUTES = 4.0
+LOD_LEVELS = 3
+# Number of own pictures.
+VIEWS = 96
 
 
 def share_or_number(text: str) -> float:
@@ -31,27 +42,34 @@ def share_or_number(text: str) -> float:
         argparse.ArgumentTypeError: It is neither.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)(%?)", text)
-    value = float(match[1]) / (100 if match[2] else 1) if match else 0.0
-    if not match or not (0 < value <= 1 if match[2] else value >= 1 and value.is_integer()):
-        raise argparse.ArgumentTypeError(f"expected a number of splats, or a share such as 25%, got {text!r}")
-    return value
+    if match:
+        value = float(match[1])
+        if match[2] and 0 < value <= 100:
+            return value / 100
+        if not match[2] and value >= 1 and value.is_integer():
+            return value
+    raise argparse.ArgumentTypeError(f"expected a number of splats, or a share such as 25%, got {text!r}")
 
 
 def splats_left(asked: float | None, count: int) -> int:
     """How many of ``count`` splats a result of :func:`share_or_number` leaves; all if it is None."""
     if asked is None:
         return count
-    return min(count, max(1, round(asked * (count if asked <= 1 else 1))))
+    number = asked * count if asked <= 1 else asked
+    return min(count, max(1, round(number)))
 
 
-DEFAULT_SIZE, MINUTES, LOD_LEVELS = "16k", 4.0, 3
-# Number of own pictures.
-VIEWS = 96
+def written_error(measure: "Measure", error: float, original: str) -> str:
+    """An error in words, with what it is to be compared with."""
+    from nsvq_lightning.compression.viewpoints import decibels
+
+    return f"error {error:.4g} ({decibels(error):.2f} dB against {original} in {len(measure.cameras)} pictures)"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq compress`` takes."""
-    add, aim = parser.add_argument, parser.add_mutually_exclusive_group().add_argument
+    add = parser.add_argument
+    aim = parser.add_mutually_exclusive_group().add_argument
     add("input", type=Path, metavar="SCENE", help=f"splat file: {', '.join(FORMATS)}")
     add("output", type=Path, metavar="OUT.nsvq", help=f"file to write; {NAME} for a streamed SOG")
     aim("--codebooks", choices=(*SIZES, "none"), help=f"codebook sizes; {DEFAULT_SIZE} by default")
@@ -84,25 +102,22 @@ def run(options: argparse.Namespace) -> int:
     """
     from nsvq_lightning.io.formats import read_scene, save, suffix_of
 
-    streamed = suffix_of(options.output) == NAME
-    aims = options.codebooks or options.max_error or options.target_bytes
-    wrong = ""
-    if suffix_of(options.output) not in (".nsvq", NAME):
-        wrong = f"{options.output}: the result is a .nsvq file or {NAME}; 'nsvq convert' writes other formats"
-    elif streamed and aims:
-        wrong = f"{NAME} has levels of detail (--levels), no codebooks and no limits"
-    elif options.levels and not streamed:
-        wrong = f"--levels is for {NAME}, but the output is {options.output}"
-    if wrong:
-        raise argparse.ArgumentError(None, wrong)
-
+    suffix = suffix_of(options.output)
+    if suffix not in (".nsvq", NAME):
+        message = f"{options.output}: the result is a .nsvq file or {NAME}; 'nsvq convert' writes other formats"
+        raise argparse.ArgumentError(None, message)
+    if suffix == NAME and (options.codebooks or options.max_error or options.target_bytes):
+        message = f"{NAME} has levels of detail (--levels), no codebooks and no limits"
+        raise argparse.ArgumentError(None, message)
+    if suffix != NAME and options.levels:
+        raise argparse.ArgumentError(None, f"--levels is for {NAME}, but the output is {options.output}")
     scene = read_scene(options.input)
-    most, books = splats_left(options.splats, len(scene)), options.codebooks or DEFAULT_SIZE
+    most = splats_left(options.splats, len(scene))
     # What is impossible is said before the scene is looked at.
     if options.target_bytes is not None:
         setting_for(options.target_bytes, most, scene.sh_degree)
     from nsvq_lightning.commands.compressor import Compressor
-    from nsvq_lightning.compression.viewpoints import Measure, decibels, own_scene
+    from nsvq_lightning.compression.viewpoints import Measure, own_scene
     from nsvq_lightning.data.datamodule import SceneDataModule
 
     splats = scene.decode()
@@ -110,31 +125,33 @@ def run(options: argparse.Namespace) -> int:
     measure = Measure(splats, cameras, scene.antialiased)
     data = SceneDataModule(photos or own_scene(splats, cameras, scene.antialiased), options.seed)
     compressor = Compressor(scene, data, measure, Storage(options.level), options.seed, options.minutes, options.steps)
-    if streamed:
-        thinner = [Setting(max(1, most // 4**level), "none") for level in range(1, options.levels or LOD_LEVELS)]
-        finest = scene if most == len(scene) else compressor.at(Setting(most, "none")).scene
-        levels = [finest, *(compressor.at(setting).scene for setting in thinner)]
+    if suffix == NAME:
+        levels = [scene if most == len(scene) else compressor.at(Setting(most, "none")).scene]
+        for level in range(1, options.levels or LOD_LEVELS):
+            levels.append(compressor.at(Setting(max(1, most // 4**level), "none")).scene)
         size = save(levels[0], options.output, coarser=levels[1:])
         counts = ", ".join(f"{len(level):,}" for level in levels)
-        sys.stdout.write(f"{options.output}: levels of {counts} splats, {size:,} bytes\n")
+        say(f"{options.output}: levels of {counts} splats, {size:,} bytes")
         return 130 if compressor.stopped else 0
     if options.max_error is not None:
         candidate = compressor.smallest_within(options.max_error, most)
     elif options.target_bytes is not None:
         candidate = compressor.finest_within(options.target_bytes, most)
     else:
-        candidate = compressor.at(Setting(most, books))
+        candidate = compressor.at(Setting(most, options.codebooks or DEFAULT_SIZE))
     options.output.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(options.output, candidate.data)
-    before, after, error = options.input.stat().st_size, len(candidate.data), compressor.error(candidate)
-    books = "no codebooks" if candidate.setting.codebooks == "none" else f"codebooks {candidate.setting.codebooks}"
+    before, after = options.input.stat().st_size, len(candidate.data)
+    sizes = candidate.setting.codebooks
+    books = "no codebooks" if sizes == "none" else f"codebooks {sizes}"
     views = "its own pictures" if photos is None else f"the photos of {photos.root}"
-    sys.stdout.write(
+    error = written_error(measure, compressor.error(candidate), "the original")
+    say(
         f"{options.output}: {len(candidate.scene):,} of {len(scene):,} splats in {after:,} bytes, "
-        f"{before / after:.1f} times smaller than {options.input.name}\n"
-        f"  {books}, fitted to {views}, error {error:.4g} "
-        f"({decibels(error):.2f} dB against the original in {len(measure.cameras)} pictures)\n"
+        f"{before / after:.1f} times smaller than {options.input.name}",
+        f"  {books}, fitted to {views}, {error}",
     )
     if compressor.stopped:
         sys.stderr.write(f"Ctrl-C ended the training early: {options.output} holds what it had reached\n")
-    return 130 if compressor.stopped else 0
+        return 130
+    return 0
