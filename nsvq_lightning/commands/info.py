@@ -2,11 +2,11 @@
 
 import argparse
 import json
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from nsvq_lightning.commands import say
 from nsvq_lightning.io.formats import describe
 
 
@@ -19,8 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Print the description of one file, without importing torch."""
     description = describe(options.file)
-    text = json.dumps(description, indent=2, ensure_ascii=False) if options.json else _text(description)
-    sys.stdout.write(text + "\n")
+    say(json.dumps(description, indent=2, ensure_ascii=False) if options.json else _text(description))
     return 0
 
 
@@ -38,12 +37,15 @@ def _text(facts: dict[str, Any]) -> str:
         rows.append(("origin", ", ".join(map(repr, facts["origin"]))))
     parts = ["\n".join(f"{name:<11} {value}" for name, value in rows)]
     if "attributes" in facts:
-        entries = ((a["name"], a["storage"], a["dim"], a["codes"], a["bits"]) for a in facts["attributes"])
+        entries = [(a["name"], a["storage"], a["dim"], a["codes"], a["bits"]) for a in facts["attributes"]]
         parts.append(_table(("attribute", "storage", "D", "K", "bits"), entries))
     if "streams" in facts:
-        streams = ((s["name"], s["encoding"], s["bytes"]) for s in facts["streams"])
-        shares = ((*row, f"{8 * row[2] / splats:.2f}", f"{100 * row[2] / size:.1f} %") for row in streams)
-        parts.append(_table(("stream", "encoding", "bytes", "bits per splat", "share"), shares))
+        streams = []
+        for stream in facts["streams"]:
+            count = stream["bytes"]
+            each = f"{8 * count / splats:.2f}", f"{100 * count / size:.1f} %"
+            streams.append((stream["name"], stream["encoding"], count, *each))
+        parts.append(_table(("stream", "encoding", "bytes", "bits per splat", "share"), streams))
     for key in ("metrics", "config"):
         if facts.get(key):
             # Without the outer braces; the lines between them are already indented by two.
@@ -53,13 +55,17 @@ def _text(facts: dict[str, Any]) -> str:
 
 
 def _table(head: tuple[str, ...], rows: Iterable[tuple[str | int, ...]]) -> str:
-    """A table of two columns of words, then columns of numbers; 0 is shown as a dash."""
-    lines = [head]
-    for row in rows:
-        lines.append(tuple(cell if isinstance(cell, str) else f"{cell:,}" if cell else "-" for cell in row))
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    padded = []
-    for line in lines:
-        cells = zip(line, widths, "<<" + ">" * (len(head) - 2), strict=True)
-        padded.append("  ".join(f"{cell:{side}{width}}" for cell, width, side in cells).rstrip())
-    return "\n".join(padded)
+    """A table of two columns of words, then columns of numbers."""
+    columns = []
+    for number, column in enumerate(zip(head, *rows, strict=True)):
+        cells = list(map(_cell, column))
+        width = max(map(len, cells))
+        columns.append([cell.ljust(width) if number < 2 else cell.rjust(width) for cell in cells])
+    return "\n".join("  ".join(line).rstrip() for line in zip(*columns, strict=True))
+
+
+def _cell(value: str | int) -> str:
+    """A word as it is, a number with commas, and 0 as a dash."""
+    if isinstance(value, str):
+        return value
+    return f"{value:,}" if value else "-"

@@ -5,13 +5,13 @@ Examples:
 """
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 
+from nsvq_lightning.commands import say
 from nsvq_lightning.commands.split import RUN
 
 
@@ -38,44 +38,45 @@ def run(options: argparse.Namespace) -> int:
     from nsvq_lightning.rendering.rasterize import render
 
     format_of(options.output)
-    found = (path.parent for path in options.parts.glob(f"*/{BLOCK}"))
-    folders = sorted(found, key=lambda path: (len(path.name), path))
+    folders = [path.parent for path in options.parts.glob(f"*/{BLOCK}")]
+    folders.sort(key=lambda path: (len(path.name), path))
     if not folders:
         raise ValueError(f"{options.parts} has no parts: make them with 'nsvq split'")
-    blocks = [Block.read(folder) for folder in folders]
     files = [folder / RUN / "scene.nsvq" for folder in folders]
-    if missing := [file for file in files if not file.is_file()]:
+    missing = [file for file in files if not file.is_file()]
+    if missing:
         untrained = f"{len(missing)} of {len(files)} parts are not trained yet"
         raise ValueError(f"{untrained}, first {missing[0]}: run their fits")
+    blocks = [Block.read(folder) for folder in folders]
     parts = []
     for folder, block, file in zip(folders, blocks, files, strict=True):
         whole = read_scene(file)
         part = whole.take(block.contains(whole.means + np.array(whole.origin))).in_use()
-        sys.stdout.write(f"{folder}: {len(part):,} of {len(whole):,} splats are in its core\n")
+        say(f"{folder}: {len(part):,} of {len(whole):,} splats are in its core")
         parts.append(part)
     photos = load_scene(blocks[0].scene)
     # Parts have the coordinates of the whole's files, whose origin only the whole knows.
     scene = replace(CompressedScene.joined(parts), origin=photos.frame.origin)
     size = save(scene, options.output)
-    sys.stdout.write(f"{options.output}: {len(scene):,} splats in {size:,} bytes\n")
+    say(f"{options.output}: {len(scene):,} splats in {size:,} bytes")
+
     splats = scene.decode()
     points = photos.points.double().numpy()
     seams = near_seams(points, blocks)
-
-    # Where parts lie apart, no photo shows a seam.
-    scores: dict[str, list[float]] = {"": [], "; at seams": [], ", elsewhere": []}
+    everywhere: list[float] = []
+    at_seams: list[float] = []
+    elsewhere: list[float] = []
     for index in photos.test:
         view = photos.view(index)
         with torch.no_grad():
             image = render(splats, view.camera, antialiased=scene.antialiased).image
-        pair = eight_bit(image), eight_bit(view.image)
         seam = torch.from_numpy(shown(points_in_front(points, view.camera), seams, view.camera))
-        for place, chosen in zip(scores, (None, seam, ~seam), strict=True):
-            masks = [each for each in (chosen, view.mask) if each is not None]
-            mask = torch.stack(masks).all(0) if masks else None
-            if mask is None or mask.any():
-                scores[place].append(float(psnr(*pair, mask)))
-    places = scores if scores["; at seams"] else [""]
-    listed = "".join(f"{place} {fmean(scores[place]):.2f} dB" for place in places)
-    sys.stdout.write(f"  test photos of {photos.root}:{listed}\n")
+        counted = torch.ones_like(seam) if view.mask is None else view.mask
+        for scores, mask in ((everywhere, counted), (at_seams, counted & seam), (elsewhere, counted & ~seam)):
+            if mask.any():
+                scores.append(float(psnr(eight_bit(image), eight_bit(view.image), mask)))
+    found = f"  test photos of {photos.root}: {fmean(everywhere):.2f} dB"
+    if at_seams:  # where parts lie apart, no photo shows a seam
+        found += f"; at seams {fmean(at_seams):.2f} dB, elsewhere {fmean(elsewhere):.2f} dB"
+    say(found)
     return 0

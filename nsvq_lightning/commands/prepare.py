@@ -12,13 +12,12 @@ Examples:
 import argparse
 import json
 import shlex
-import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
+from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import positive
 from nsvq_lightning.io.atomic import write_text
 
@@ -55,11 +54,11 @@ def run(options: argparse.Namespace) -> int:
     source, scene = options.source, options.scene
     if not source.exists():
         raise FileNotFoundError(f"{source}: no such file or folder of photos")
-    is_video = source.is_file() and source.suffix.lower() in reconstruct.VIDEOS
-    if source.is_file() and not is_video:
+    is_video = source.is_file()
+    if is_video and source.suffix.lower() not in reconstruct.VIDEOS:
         raise ValueError(f"{source}: neither a folder of photos nor a video ({', '.join(reconstruct.VIDEOS)})")
     if not is_video:
-        photos, left = reconstruct.photos_in(source)  # before anything is written
+        photos, left_out = reconstruct.photos_in(source)  # before anything is written
     images = scene / "images"
     in_place = source.resolve() == images.resolve()
     _claim(options, is_video, in_place)
@@ -72,38 +71,35 @@ def run(options: argparse.Namespace) -> int:
         if done >= total:
             bars[step].close()
 
-    left_out: list[str] = []
+    remarks = []
     if is_video:
         names = _frames(options, images, report)
     else:
-        folder = source if in_place else images
-        names, closed = reconstruct.copy_photos(photos, source, folder, report)
-        left_out = [f"left out: {reconstruct.some(files)}: {reason}" for reason, files in (left | closed).items()]
+        names, closed = reconstruct.copy_photos(photos, source, source if in_place else images, report)
+        for reason, files in {**left_out, **closed}.items():
+            remarks.append(f"left out: {reconstruct.some(files)}: {reason}")
     if len(names) < 2:
         few = f"{source}: {len(names)} pictures are too few, a scene takes 50 to 300"
-        raise ValueError("; ".join([few, *left_out]))
-    _say(left_out)
+        raise ValueError("; ".join([few, *remarks]))
     if find_model(source):
-        _say([f"{source} has cameras already: nsvq fit --data.root {shlex.quote(str(source))} uses them"])
-    _say(reconstruct.oddities(images, names))
+        remarks.append(f"{source} has cameras already: nsvq fit --data.root {shlex.quote(str(source))} uses them")
+    say(*remarks, *reconstruct.oddities(images, names))
     before = {*reconstruct.stamps_in(scene), *reconstruct.stamps_in(scene / "sparse")}
     verdict = reconstruct.reconstruct(scene, names, report, is_video, options.max_size, options.threads)
     if not in_place:
         for name in before.difference(names):
             (images / name).unlink(missing_ok=True)
-    _say(verdict.told(images))
-    _say(["\nchecking the scene: every photo is read once, then steps of training are timed"])
+    say(*verdict.told(images))
+    say("\nchecking the scene: every photo is read once, then steps of training are timed")
     if shown(check_folder(scene))["problem"]:
         return 1
     database = scene / reconstruct.DATABASE
     size = database.stat().st_size / 1e6
-    _say([f"\n{database} ({size:.0f} MB) saves time when photos are added, and may be deleted"])
-    _say([f"next: nsvq fit --data.root {shlex.quote(str(scene))}"])
+    say(
+        f"\n{database} ({size:.0f} MB) saves time when photos are added, and may be deleted",
+        f"next: nsvq fit --data.root {shlex.quote(str(scene))}",
+    )
     return 0
-
-
-def _say(lines: Iterable[str]) -> None:
-    sys.stdout.writelines(f"{line}\n" for line in lines)
 
 
 def _frames(options: argparse.Namespace, images: Path, report: "Report") -> list[str]:
@@ -114,7 +110,7 @@ def _frames(options: argparse.Namespace, images: Path, report: "Report") -> list
     if (options.scene / reconstruct.DATABASE).exists():
         return [name for name in reconstruct.stamps_in(options.scene) if (images / name).exists()]
     names = reconstruct.write_frames(options.source, images, options.frames, report)
-    _say([f"{len(names)} sharp frames"])
+    say(f"{len(names)} sharp frames")
     return names
 
 
@@ -122,21 +118,24 @@ def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
     """Take the folder of the scene; what another preparation has left in it is continued."""
     from nsvq_lightning.data import reconstruct
 
-    scene: Path = options.scene
+    scene = options.scene
     record = {"source": str(options.source.resolve()), "max_size": options.max_size}
     if is_video:
         record["frames"] = options.frames
-    path, own = scene / reconstruct.RECORD, {"images"} if in_place else set()
-    if path.is_file() and not options.again:
+    path = scene / reconstruct.RECORD
+    if not path.is_file():
+        own = {"images"} if in_place else set()
+        if scene.is_dir() and {each.name for each in scene.iterdir()} - own:
+            raise ValueError(f"{scene} is not empty and was not made by this command: name a new folder")
+    elif options.again:
+        reconstruct.remove_database(scene)
+        # The model stays until there is another, and is of no photo as it is now.
+        outdated = dict.fromkeys(reconstruct.stamps_in(scene / "sparse"), "")
+        if outdated:
+            write_text(scene / "sparse" / reconstruct.STAMPS, json.dumps(outdated))
+    else:
         found = json.loads(path.read_text(encoding="utf-8"))
         if found != record:
             raise ValueError(f"{scene} was prepared from {found.get('source')} or otherwise: --again begins anew")
-    elif scene.is_dir() and not path.is_file() and {each.name for each in scene.iterdir()} - own:
-        raise ValueError(f"{scene} is not empty and was not made by this command: name a new folder")
-    if options.again and path.is_file():
-        reconstruct.remove_database(scene)
-        # The model stays until there is another, and is of no photo as it is now.
-        if outdated := dict.fromkeys(reconstruct.stamps_in(scene / "sparse"), ""):
-            write_text(scene / "sparse" / reconstruct.STAMPS, json.dumps(outdated))
     (scene / "images").mkdir(parents=True, exist_ok=True)
     write_text(path, json.dumps(record, indent=2) + "\n")

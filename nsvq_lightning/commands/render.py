@@ -13,13 +13,15 @@ Examples:
 import argparse
 import logging
 import math
-import sys
+import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
+from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import cameras_of, positive, scene_file
 
 if TYPE_CHECKING:
@@ -28,7 +30,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FPS, SECONDS = 24.0, 10.0
+FPS = 24.0
+SECONDS = 10.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,17 +53,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
+    match = re.fullmatch(r"0*([1-9]\d*)x0*([1-9]\d*)", text.lower())
+    if match is None:
         raise argparse.ArgumentTypeError(f"must be like 1280x720, got {text}")
-    return int(width), int(height)
+    return int(match[1]), int(match[2])
 
 
 def _color(text: str) -> tuple[float, ...]:
-    if text in ("black", "white"):
-        return (float(text == "white"),) * 3
+    named = {"black": "0,0,0", "white": "1,1,1"}
     try:
-        values = tuple(float(part) for part in text.split(","))
+        values = tuple(map(float, named.get(text, text).split(",")))
     except ValueError:
         values = ()
     if len(values) != 3 or not all(0 <= value <= 1 for value in values):
@@ -91,14 +93,19 @@ def run(options: argparse.Namespace) -> int:
     splats = scene.decode()
     cameras, fps = _path(options, splats, is_video)
     device = best_device()
-    raw, background = splats.to(device).raw(), torch.tensor(options.background, device=device)
-    how = {"background": background, "antialiased": scene.antialiased, "backend": options.backend}
+    raw = splats.to(device).raw()
+    look = partial(
+        render,
+        background=torch.tensor(options.background, device=device),
+        antialiased=scene.antialiased,
+        backend=options.backend,
+    )
     width, height = cameras[0].width, cameras[0].height
     with torch.no_grad(), frame_writer(output, width, height, fps) as write:
         for camera in tqdm(cameras, unit=" frames", mininterval=1):
-            write(render(raw, camera, **how).image)
+            write(look(raw, camera).image)
     length = f", {len(cameras) / fps:.1f} s at {fps:g} frames per second" if is_video else ""
-    sys.stdout.write(f"{output}: {len(cameras)} frames of {width}x{height}{length}\n")
+    say(f"{output}: {len(cameras)} frames of {width}x{height}{length}")
     return 0
 
 
@@ -107,29 +114,29 @@ def _path(options: argparse.Namespace, splats: "Splats", is_video: bool) -> "tup
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.rendering.camera_paths import orbit, read_camera_path, reframed, smooth_path
 
-    fps, kind = options.fps or FPS, options.path
-    given = list(cameras_of(options.scene, options.root).values())
-    if kind not in (None, "through", "cameras", "orbit"):
-        near = min(camera.near for camera in given or likely_cameras(splats, 1))  # which the path does not say
+    cameras = list(cameras_of(options.scene, options.root).values())
+    kind = options.path or ("through" if cameras else "orbit")
+    fps = options.fps or FPS
+    if kind not in ("through", "cameras", "orbit"):
+        near = min(camera.near for camera in cameras or likely_cameras(splats, 1))  # which the path does not say
         path, own = read_camera_path(Path(kind))
-        given, fps = [replace(camera, near=near) for camera in path], options.fps or own
-    else:
-        kind = kind or ("through" if given else "orbit")
-        if not given and kind != "orbit":
+        cameras = [replace(camera, near=near) for camera in path]
+        fps = options.fps or own
+    elif not cameras:
+        if kind != "orbit":
             message = f"--path {kind} needs the cameras of photos: name their folder with --data.root, or take orbit"
             raise ValueError(message)
-        if not given:
-            log.info("no photos: their cameras are guessed from the scene; --data.root names the folder of the photos")
-            given = likely_cameras(splats, 24)
-    width, height = options.size or (given[0].width, given[0].height)
+        log.info("no photos: their cameras are guessed from the scene; --data.root names the folder of the photos")
+        cameras = likely_cameras(splats, 24)
+    width, height = options.size or (cameras[0].width, cameras[0].height)
     if is_video and (width % 2 or height % 2):
         width, height = max(2, width - width % 2), max(2, height - height % 2)
         log.info("videos have even sides: %dx%d", width, height)
-    given = [reframed(camera, width, height) for camera in given]
+    cameras = [reframed(camera, width, height) for camera in cameras]
     frames = options.frames or max(1, round((options.seconds or SECONDS) * fps))
     if kind == "orbit":
-        return orbit(given, frames), fps
-    if kind == "through":
-        every = min(3, math.ceil(len(given) / 2))  # photos are not evenly spaced
-        return smooth_path([*given[:-1:every], given[-1]], frames), fps
-    return given, fps
+        cameras = orbit(cameras, frames)
+    elif kind == "through":
+        every = min(3, math.ceil(len(cameras) / 2))  # photos are not evenly spaced
+        cameras = smooth_path([*cameras[:-1:every], cameras[-1]], frames)
+    return cameras, fps

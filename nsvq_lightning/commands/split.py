@@ -14,7 +14,11 @@ import shlex
 import sys
 from pathlib import Path
 
+from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import positive
+
+# Folder of a part's run.
+RUN = "run"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,10 +50,7 @@ def run(options: argparse.Namespace) -> int:
         folder.mkdir(parents=True)
     for folder, (train, test) in zip(folders, write_blocks(scene, blocks, folders), strict=True):
         sys.stderr.write(f"{folder}: {train} train and {test} test photos\n")
-        where = [f"--data.root={folder.resolve()}", f"--trainer.run_folder={folder.resolve() / RUN}"]
-        sys.stdout.write(shlex.join(["nsvq", "fit", *where, *options.further]) + "\n")
+        root = folder.resolve()
+        fit = ["nsvq", "fit", f"--data.root={root}", f"--trainer.run_folder={root / RUN}", *options.further]
+        say(shlex.join(fit))
     return 0
-
-
-# Folder of a part's run.
-RUN = "run"

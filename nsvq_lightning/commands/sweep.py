@@ -19,7 +19,7 @@ import signal
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from itertools import product
 from pathlib import Path
@@ -27,12 +27,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import integers, names
 from nsvq_lightning.commands.settings import expand
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.version import __version__
 
 log = logging.getLogger(__name__)
+
+# What a line of ``results.csv`` says, by column.
+Row = dict[str, Any]
+
+# In the folder of a run.
+CHECKPOINT = Path("checkpoints", "last.ckpt")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,12 +49,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(further=())
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="where all results go")
     add = parser.add_argument_group("what is combined; lists have commas between their entries").add_argument
-    listed: dict[str, Any] = {"type": names, "default": ()}
+    # An empty entry leaves the choice to the configuration.
+    listed: dict[str, Any] = {"type": names, "default": ("",)}
     add("--scenes", **listed, metavar="A,B", help="COLMAP folders (default: that of the configuration)")
     add("--configs", **listed, metavar="A,B", help="files or shipped names, as for nsvq fit --config")
     add("--quantizers", **listed, metavar="A,B", help="classes, as for nsvq fit --model.quantizer")
     add("--codebooks", **listed, metavar="1k,4k", help="sizes, for configurations that have codebooks")
-    add("--seeds", type=integers, default=(), metavar="0,1,2", help="of the draws and of the order of the views")
+    help_ = "of the draws and of the order of the views"
+    add("--seeds", type=integers, default=("",), metavar="0,1,2", help=help_)
     add("--max-steps", type=int, metavar="N", help="iterations of every run (default: those of its configuration)")
     parser.add_argument("--keep-checkpoints", action="store_true", help="keep those of finished runs")
     help_ = "only print a command for each unfinished run, to be run anywhere"
@@ -75,7 +84,8 @@ def run(options: argparse.Namespace) -> int:
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         if options.commands:
-            sys.stdout.writelines(commands(runs))
+            for command in commands(runs):
+                say(command)
             return 0
         rows = sweep(output, runs, options.keep_checkpoints)
     except KeyboardInterrupt:
@@ -86,9 +96,6 @@ def run(options: argparse.Namespace) -> int:
         let_go(output)
     sys.stdout.write((output / "results.md").read_text(encoding="utf-8"))
     return int(any(row["error"] for row in rows))
-
-
-Row = dict[str, Any]
 
 
 class Run(NamedTuple):
@@ -114,8 +121,7 @@ class Run(NamedTuple):
 def plan(options: argparse.Namespace) -> list[Run]:
     """All runs that options of ``nsvq sweep`` ask for, one configuration after the other.
 
-    An empty list leaves the choice to the configurations. Quantizers and codebook sizes are only for those that have
-    codebooks.
+    Quantizers and codebook sizes are only for configurations that have codebooks.
 
     Raises:
         SystemExit: A configuration or an option of ``nsvq fit`` is wrong; a line on stderr says how.
@@ -126,37 +132,52 @@ def plan(options: argparse.Namespace) -> list[Run]:
 
     from nsvq_lightning.splats.attributes import codebook_sizes
 
-    for size in options.codebooks:
+    for size in filter(None, options.codebooks):
         codebook_sizes(size)
-    for scene in options.scenes:
+    for scene in filter(None, options.scenes):
         if not Path(scene).is_dir():
             raise ValueError(f"{scene} is no folder; --scenes takes COLMAP folders with commas between them")
     common = [*options.further, "--trainer.logger=false"]
     if options.max_steps is not None:
         common.append(f"--trainer.max_steps={options.max_steps}")
     runs: list[Run] = []
-    for config in options.configs or ("",):
-        arguments = [f"--config={config}", *common] if config else common
-        default = yaml.safe_load(resolve([*arguments, *(f"--data.root={scene}" for scene in options.scenes[:1])]))
+    for config in options.configs:
+        arguments = [*_given({"config": config}), *common]
+        default = yaml.safe_load(resolve([*arguments, *_given({"data.root": options.scenes[0]})]))
         if default["ckpt_path"] is not None:
             raise ValueError(f"a sweep has checkpoints of its own; leave ckpt_path={default['ckpt_path']} out")
-        roots = options.scenes or (default["data"]["init_args"].get("root", ""),)
         quantizers, sizes = options.quantizers, options.codebooks
         if default["model"]["codebooks"] is None:
-            quantizers = sizes = ()
-        for root, quantizer, size, seed in product(roots, quantizers or ("",), sizes or ("",), options.seeds or ("",)):
+            quantizers = sizes = ("",)
+        for scene, quantizer, size, seed in product(options.scenes, quantizers, sizes, options.seeds):
             # Absolute, so that the same sweep started from another folder finds its runs.
-            chosen = [("data.root", Path(root).resolve()), ("model.quantizer", quantizer), ("model.codebooks", size)]
-            chosen += [("model.seed", seed), ("data.seed", seed)]
-            text = resolve([*arguments, *(f"--{option}={value}" for option, value in chosen if value != "")])
-            labels = {"scene": Path(root).resolve().name, "config": Path(config).stem or "default"}
-            labels |= {"quantizer": quantizer.rpartition(".")[2], "codebooks": size, "seed": seed}
+            root = Path(scene or default["data"]["init_args"].get("root", "")).resolve()
+            chosen = {
+                "data.root": root,
+                "model.quantizer": quantizer,
+                "model.codebooks": size,
+                "model.seed": seed,
+                "data.seed": seed,
+            }
+            text = resolve([*arguments, *_given(chosen)])
+            labels = {
+                "scene": root.name,
+                "config": Path(config).stem or "default",
+                "quantizer": quantizer.rpartition(".")[2],
+                "codebooks": size,
+                "seed": seed,
+            }
             title = "-".join(str(name) for name in labels.values() if name != "")
             if any(run.names == labels for run in runs):
                 raise ValueError(f"two runs are called {title}: rename a scene or configuration to tell them apart")
             digest = hashlib.sha256(f"{__version__}\n{text}".encode()).hexdigest()
             runs.append(Run(labels, text, options.output.resolve() / "runs" / f"{title}-{digest[:12]}"))
     return runs
+
+
+def _given(chosen: Mapping[str, object]) -> list[str]:
+    """Options of ``nsvq fit`` for what has been chosen, and is not empty."""
+    return [f"--{option}={value}" for option, value in chosen.items() if value != ""]
 
 
 def resolve(arguments: Sequence[str]) -> str:
@@ -176,9 +197,6 @@ def resolve(arguments: Sequence[str]) -> str:
             if end.code:
                 raise
     return printed.getvalue()
-
-
-CHECKPOINT = Path("checkpoints", "last.ckpt")
 
 
 def prepare(run: Run) -> list[str]:
@@ -202,11 +220,14 @@ def prepare(run: Run) -> list[str]:
             for path in map(run.folder.joinpath, RUN_FILES):
                 shutil.rmtree(path, ignore_errors=True)
                 path.unlink(missing_ok=True)
-        write_text(run.folder / "config.yaml", run.config)
+        config = run.folder / "config.yaml"
+        write_text(config, run.config)
     finally:
         let_go(run.folder)
-    arguments = ["fit", "--config", str(run.folder / "config.yaml"), f"--trainer.run_folder={run.folder}"]
-    return [*arguments, f"--ckpt_path={run.folder / CHECKPOINT}"] if begun else arguments
+    arguments = ["fit", "--config", str(config), f"--trainer.run_folder={run.folder}"]
+    if begun:
+        arguments.append(f"--ckpt_path={run.folder / CHECKPOINT}")
+    return arguments
 
 
 def commands(runs: Sequence[Run]) -> Iterator[str]:
@@ -214,7 +235,7 @@ def commands(runs: Sequence[Run]) -> Iterator[str]:
     for run in runs:
         if not run.is_finished:
             try:
-                yield shlex.join(["nsvq", *prepare(run)]) + "\n"
+                yield shlex.join(["nsvq", *prepare(run)])
             except FileExistsError as error:
                 log.info("%s", error)
 
@@ -255,10 +276,12 @@ def train(run: Run) -> str:
     if status == 0:
         return "" if run.is_finished else f"the run has left no metrics.json: callbacks.report must stay (see {said})"
     if status < 0:
-        return f"killed by signal {-status}{', perhaps for want of memory' * (status == -9)} (see {said})"
-    lines = [line.strip() for line in said.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+        guess = ", perhaps for want of memory" if status == -signal.SIGKILL else ""
+        return f"killed by signal {-status}{guess} (see {said})"
+    reason = f"exit status {status}"
+    lines = list(filter(None, map(str.strip, said.read_text(encoding="utf-8", errors="replace").splitlines())))
     errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
-    return f"{(errors or lines or [f'exit status {status}'])[-1]} (see {said})"
+    return f"{[reason, *lines, *errors][-1]} (see {said})"
 
 
 def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> list[Row]:
@@ -274,13 +297,14 @@ def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> 
     Returns:
         A row for each run, in their order.
     """
-    failed: dict[Path, str] = {}
+    failed = {}
     for number, run in enumerate(runs, start=1):
-        if not run.is_finished and (error := train(run)):
+        error = "" if run.is_finished else train(run)
+        if error:
             failed[run.folder] = error
         elif not keep_checkpoints:  # they are larger than everything else
             shutil.rmtree(run.folder / CHECKPOINT.parent, ignore_errors=True)
-        log.info("[%d/%d] %s: %s", number, len(runs), run.folder.name, failed.get(run.folder, "finished"))
+        log.info("[%d/%d] %s: %s", number, len(runs), run.folder.name, error or "finished")
         known = [each for each in runs if each.is_finished or each.folder in failed]
         rows = [row_of(each, failed.get(each.folder, "")) for each in known]
         write_results(output, rows)
@@ -329,23 +353,29 @@ def write_results(output: Path, rows: Sequence[Row]) -> None:
     from nsvq_lightning.report import numbers, pictures
 
     groups: dict[tuple[str, ...], list[Row]] = {}
+    failed = []
     for row in rows:
-        if not row["error"]:
+        if row["error"]:
+            failed.append("* {scene}, {config}, {codebooks}, seed {seed}: {error}\n".format(**row))
+        else:
             groups.setdefault(tuple(row[name] for name in NAMES), []).append(row)
     lines = []
     for key, group in groups.items():
         line = [*(name or "–" for name in key), str(len(group))]
         for column, form in TABLE.items():
             mean, spread = moments(group, column)
-            plus_minus = f" ± {spread:{form}}" if len(group) > 1 else ""
-            line.append("–" if np.isnan(mean) else f"{mean:{form}}{plus_minus}")
+            text = "–" if np.isnan(mean) else f"{mean:{form}}"
+            if len(group) > 1 and not np.isnan(mean):
+                text += f" ± {spread:{form}}"
+            line.append(text)
         lines.append(line)
     text = f"# nsvq sweep\n\n{numbers.markdown_table([*NAMES, 'runs', *TABLE], lines, words=NAMES)}\n\n"
     text += "Mean ± standard deviation over the seeds. PSNR (dB) and SSIM are of the decoded file on the test views, "
     text += "psnr_before of the plain splats.\n"
-    failed = ["* {scene}, {config}, {codebooks}, seed {seed}: {error}\n".format(**row) for row in rows if row["error"]]
+    if failed:
+        text += "\nFailed:\n\n" + "".join(failed)
     numbers.write_csv(output / "results.csv", rows)
-    write_text(output / "results.md", text + "".join(["\nFailed:\n\n", *failed] if failed else failed))
+    write_text(output / "results.md", text)
     if groups:
         pictures.write_figure(output / "results.png", figure(list(groups.values())))
 
@@ -365,17 +395,19 @@ def figure(groups: Sequence[Sequence[Row]]) -> Any:
     """
     from nsvq_lightning.report.pictures import new_figure
 
-    curves: dict[str, dict[str, list[Sequence[Row]]]] = {}
+    scenes: dict[str, dict[str, list[Sequence[Row]]]] = {}
     for group in groups:
-        name = ", ".join(filter(None, (group[0]["config"], group[0]["quantizer"])))
-        curves.setdefault(group[0]["scene"], {}).setdefault(name, []).append(group)
-    drawn = new_figure(7.0, 4.6 * len(curves))  # inches
-    for axis, (scene, named) in zip(drawn.subplots(len(curves), squeeze=False).flat, curves.items(), strict=True):
-        for name, points in named.items():
+        first = group[0]
+        name = ", ".join(filter(None, (first["config"], first["quantizer"])))
+        scenes.setdefault(first["scene"], {}).setdefault(name, []).append(group)
+    drawn = new_figure(7.0, 4.6 * len(scenes))  # inches
+    for number, (scene, curves) in enumerate(scenes.items(), start=1):
+        axis = drawn.add_subplot(len(scenes), 1, number)
+        for name, points in curves.items():
             points.sort(key=lambda point: moments(point, "bytes"))
             x, x_spread = np.transpose([moments(point, "bytes") for point in points]) / 1e6
             y, y_spread = np.transpose([moments(point, "psnr") for point in points])
-            axis.errorbar(x, y, yerr=y_spread, xerr=x_spread, fmt="o-", linewidth=1, capsize=2, label=name)
+            axis.errorbar(x, y, y_spread, x_spread, fmt="o-", linewidth=1, capsize=2, label=name)
             for point, *place in zip(points, x, y, strict=True):
                 axis.annotate(point[0]["codebooks"], place, (4, 5), textcoords="offset points", fontsize=7)
         # Files without codebooks are many times as large.

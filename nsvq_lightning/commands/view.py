@@ -8,6 +8,7 @@ Examples:
 """
 
 import argparse
+import math
 import sys
 import tempfile
 import webbrowser
@@ -15,10 +16,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import cameras_of, scene_file
 
 if TYPE_CHECKING:
@@ -65,19 +68,20 @@ def run(options: argparse.Namespace) -> int:
         if options.output is not None:
             options.output.parent.mkdir(parents=True, exist_ok=True)
             size = write_viewer(options.output, file, cameras, title)
-            sys.stdout.write(f"{options.output}: {size:,} bytes\n")
+            say(f"{options.output}: {size:,} bytes")
             return 0
         # Seconds between two looks.
         page = viewer_page(file, cameras, title, live=3.0 if options.live else 0.0).encode()
         live = options.scene / LIVE_SCENE if options.live else None
-        handler = type("Handler", (_Handler,), {"page": page, "file": file, "live": live, "host": options.host})
+        settings = {"page": page, "file": file, "live": live, "host": options.host}
+        handler = type("Handler", (_Handler,), settings)
         try:
             server = _Server((options.host, options.port), handler)
         except OSError as error:
             raise OSError(f"cannot listen on {options.host}:{options.port} ({error}); choose another --port") from None
         with server:
             address = f"http://{options.host}:{server.server_port}/"
-            sys.stdout.write(f"{title} is at {address} until Ctrl-C\n")
+            say(f"{title} is at {address} until Ctrl-C")
             if options.open:
                 webbrowser.open(address)
             server.serve_forever()
@@ -103,13 +107,19 @@ def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
         yield made
 
 
+# As many as the page of a run has.
+MAX_CAMERAS = 300
+
+
 def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     """Cameras of the photos, or guessed ones."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.io.formats import load
 
-    if cameras := list(cameras_of(options.scene, options.root).items()):
-        return dict(cameras[:: -(-len(cameras) // 300)])  # at most as many as the page of a run has
+    cameras = cameras_of(options.scene, options.root)
+    if cameras:
+        every = math.ceil(len(cameras) / MAX_CAMERAS)
+        return dict(islice(cameras.items(), 0, None, every))
     if options.live:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
     splats = load(file)
@@ -154,14 +164,13 @@ class _Handler(BaseHTTPRequestHandler):
 
         if is_question and self.live is not None:
             # What was asked of a run that has ended in between is taken back.
-            (viewer.end_live if self.file.exists() else viewer.ask_live)(self.live.parent)
-        files = [file for file in (self.live, self.file) if file is not None and file.is_file()]
-        file = files[0] if files else None
+            ask = viewer.end_live if self.file.exists() else viewer.ask_live
+            ask(self.live.parent)
+        file = self.live if self.live is not None and self.live.is_file() else self.file
         try:
-            if file is None and self.followed:
-                self._answer(503, b"the run trains no more; its scene is not there yet")
-            elif file is None:
-                self._answer(503, b"waiting for the run to show its splats")
+            if not file.is_file():
+                trains = b"waiting for the run to show its splats"
+                self._answer(503, b"the run trains no more; its scene is not there yet" if self.followed else trains)
             elif is_question:
                 self._answer(200, f"{file.name} {file.stat().st_mtime_ns}".encode())
             else:
