@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from nsvq_lightning.compression.viewpoints import Measure
 
 DEFAULT_SIZE = "16k"
-MINUTES = 4.0
 LOD_LEVELS = 3
 # Number of own pictures.
 VIEWS = 96
@@ -79,14 +78,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--splats", type=share_or_number, metavar="N", help=help_)
     help_ = f"levels of detail of {NAME}, each with a quarter of the splats of the one before; {LOD_LEVELS} by default"
     aim("--levels", type=positive(int), metavar="N", help=help_)
-    add("--level", choices=LEVELS, default=DEFAULT_LEVEL, help=f"{DEFAULT_LEVEL} by default")
+    add("--level", choices=LEVELS, default=DEFAULT_LEVEL, help="%(default)s by default")
     add("--seed", type=int, default=0, help="seed of all draws")
     help_ = "scene folder with the photos: splats and codebooks are fitted to its train photos"
     add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
     help_ = "steps of a training; 500, or 1500 with fewer splats, if they fit into --minutes"
     add("--steps", type=positive(int), metavar="N", help=help_)
-    help_ = f"what one training may take, about; {MINUTES:g} by default"
-    add("--minutes", type=positive(float), default=MINUTES, metavar="M", help=help_)
+    help_ = "what one training may take, about; %(default)g by default"
+    add("--minutes", type=positive(float), default=4.0, metavar="M", help=help_)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -94,8 +94,16 @@ PARSER_SETTINGS["fit"]["default_config_files"] = [find_config("fast")]
 
 
 # A gate that nobody passes would let a checkpoint import what it names.
-OVERRIDDEN = "_get", "_parse_ckpt_path", "_parser", "_prepare_subcommand_parser", "_run_subcommand", "_set_seed"
-check_replaced("lightning", LightningCLI, *OVERRIDDEN)
+check_replaced(
+    "lightning",
+    LightningCLI,
+    "_get",
+    "_parse_ckpt_path",
+    "_parser",
+    "_prepare_subcommand_parser",
+    "_run_subcommand",
+    "_set_seed",
+)
 
 
 class SplatCLI(LightningCLI):

@@ -6,17 +6,15 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from nsvq_lightning.commands.benchmark import quantize
+from nsvq_lightning.commands.benchmark.render import painter
 from nsvq_lightning.commands.benchmark.timing import Measurement, Scope, compare
 from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.compression.stored import to_compressed
 from nsvq_lightning.io.formats import load, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.quantize.codebook import as_quantizer
-from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.splats import SplatTensors
 
 
 def run(scope: Scope) -> Iterator[Measurement]:
@@ -34,7 +32,8 @@ def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Measu
     writers: dict[str, Callable[[Path], int]] = {".ply": partial(save, splats)}
     for level in LEVELS:
         writers[f".nsvq {level}"] = partial(save, scene, storage=Storage(level))
-    truths = {".ply": _image(workload, splats), ".nsvq": _image(workload, scene.decode())}
+    look = torch.no_grad()(painter("auto"))
+    truths = {".ply": look(splats, workload), ".nsvq": look(scene.decode().raw(), workload)}
     writes = {}
     reads: dict[str, Callable[[], object]] = {}
     values = {}
@@ -44,7 +43,7 @@ def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Measu
         writes[name] = partial(write, path)
         reads[name] = partial(load, path)
         size = write(path)
-        error = _image(workload, load(path)) - truths[suffix]
+        error = look(load(path).raw(), workload) - truths[suffix]
         values[name] = {
             "bytes a splat": size / len(splats.means),
             "bytes": float(size),
@@ -53,9 +52,3 @@ def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Measu
     described = f"{workload.name}, {scope.codebooks} codebooks"
     yield from compare("write", described, writes, values, scope)
     yield from compare("read", described, reads, values, scope)
-
-
-@torch.no_grad()
-def _image(workload: Workload, splats: SplatTensors) -> Tensor:
-    """The workload's view of some splats ``[H, W, 3]``."""
-    return render(splats, workload.camera, background=workload.background).image
