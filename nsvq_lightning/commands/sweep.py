@@ -49,8 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(further=())
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="where all results go")
     add = parser.add_argument_group("what is combined; lists have commas between their entries").add_argument
-    # An empty entry leaves the choice to the configuration.
-    listed: dict[str, Any] = {"type": names, "default": ("",)}
+    listed: dict[str, Any] = {"type": _entries, "default": ("",)}
     add("--scenes", **listed, metavar="A,B", help="COLMAP folders (default: that of the configuration)")
     add("--configs", **listed, metavar="A,B", help="files or shipped names, as for nsvq fit --config")
     add("--quantizers", **listed, metavar="A,B", help="classes, as for nsvq fit --model.quantizer")
@@ -61,6 +60,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--keep-checkpoints", action="store_true", help="keep those of finished runs")
     help_ = "only print a command for each unfinished run, to be run anywhere"
     parser.add_argument("--commands", action="store_true", help=help_)
+
+
+def _entries(text: str) -> tuple[str, ...]:
+    """Those of a list; an empty one, which leaves the choice to the configuration, if there is none."""
+    return names(text) or ("",)
 
 
 def run(options: argparse.Namespace) -> int:

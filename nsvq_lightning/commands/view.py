@@ -169,8 +169,10 @@ class _Handler(BaseHTTPRequestHandler):
         file = self.live if self.live is not None and self.live.is_file() else self.file
         try:
             if not file.is_file():
-                trains = b"waiting for the run to show its splats"
-                self._answer(503, b"the run trains no more; its scene is not there yet" if self.followed else trains)
+                message = b"waiting for the run to show its splats"
+                if self.followed:
+                    message = b"the run trains no more; its scene is not there yet"
+                self._answer(503, message)
             elif is_question:
                 self._answer(200, f"{file.name} {file.stat().st_mtime_ns}".encode())
             else:

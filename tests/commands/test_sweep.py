@@ -88,6 +88,7 @@ def test_a_configuration_may_bring_everything(tmp_path: Path) -> None:
     settings = yaml.safe_load(run.config)
     assert (settings["model"]["seed"], settings["model"]["codebooks"]) == (5, {"scales": 8})
     assert settings["trainer"]["max_steps"] == 9
+    assert planned(f"--configs={own}", "--scenes=", "--codebooks=", "--trainer.max_steps", "9") == [run]
 
 
 def test_the_short_options_of_fit_hold_for_every_run(scenes: tuple[str, str]) -> None:

@@ -8,7 +8,7 @@ import re
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -76,7 +76,7 @@ class Measurement:
     method: str
     samples: Sequence[float]
     sgemm: Sequence[float]
-    values: Mapping[str, float] = field(default_factory=dict)
+    values: Mapping[str, float]
 
     @property
     def median(self) -> float:

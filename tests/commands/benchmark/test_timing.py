@@ -56,7 +56,7 @@ def test_the_collector_is_put_back() -> None:
 
 
 def test_summary_of_known_samples() -> None:
-    known = Measurement("search", "W", "fast", (5.0, 1.0, 2.0, 4.0, 3.0), (10.0, 30.0, 20.0))
+    known = Measurement("search", "W", "fast", (5.0, 1.0, 2.0, 4.0, 3.0), (10.0, 30.0, 20.0), {})
     assert (known.median, known.ratio) == (3.0, 0.15)
 
 
