@@ -15,7 +15,7 @@ import platform
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -91,7 +91,9 @@ class Finding(NamedTuple):
 
 def judged(subject: str, text: str, advice: str, *, when: bool) -> Finding:
     """A note with the advice when something is not as it should be, otherwise good."""
-    return Finding("note", subject, f"{text}: {advice}") if when else Finding("good", subject, text)
+    if when:
+        return Finding("note", subject, f"{text}: {advice}")
+    return Finding("good", subject, text)
 
 
 def attempt(subject: str, check: Iterator[Finding]) -> Iterator[Finding]:
@@ -215,17 +217,19 @@ def check_model(root: Path) -> Iterator[Finding]:
 
 def check_cameras(model: "ColmapModel") -> Iterator[Finding]:
     """Number, models and sizes of the cameras, and what distortion does to the corners."""
+    photos = len(model.images)
     cameras = [model.cameras[number] for number in {image.camera_id for image in model.images}]
-    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    sizes = {(camera.width, camera.height) for camera in cameras}
     names = sorted({camera.model_name for camera in cameras})
-    text = f"{len(cameras)} of {'/'.join(names)}, {_range(sizes)}, for {len(model.images)} registered photos"
-    many = model.source == "COLMAP" and len(cameras) > max(1, len(model.images) // 2) and len(sizes) <= 2
+    text = f"{len(cameras)} of {'/'.join(names)}, {_range(sizes)}, for {photos} registered photos"
     advice = "more exact if one lens took them and COLMAP knows it (--ImageReader.single_camera 1)"
-    yield judged("cameras", text, advice, when=many)
+    many = len(cameras) > max(1, photos // 2) and len(sizes) <= 2
+    yield judged("cameras", text, advice, when=model.source == "COLMAP" and many)
 
 
-def _range(sizes: Sequence[tuple[int, int]]) -> str:
-    ends = dict.fromkeys((min(sizes), max(sizes)))
+def _range(sizes: Collection[tuple[int, int]]) -> str:
+    """The smallest and the largest of some sizes."""
+    ends = sorted({min(sizes), max(sizes)})
     return " to ".join(f"{width}x{height}" for width, height in ends)
 
 
@@ -314,7 +318,7 @@ def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
         size = camera.width, camera.height
         others += not same_shape(source.size, size)
         scaled += source.size != size
-    used = _range([(source.pinhole.width, source.pinhole.height) for source in sources])
+    used = _range({(source.pinhole.width, source.pinhole.height) for source in sources})
     text = f"trained at {used}; {others or scaled} of {len(sources)} files "
     if others:
         yield Finding("problem", "sizes", f"{text}{OTHER_SHAPE}")

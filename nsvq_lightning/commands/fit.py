@@ -174,9 +174,7 @@ class SplatCLI(LightningCLI):
         seed = self._get(self.config, "seed_everything")
         if seed is False:
             return
-        model = self._get(self.config, "model")
-        data = self._get(self.config, "data").get("init_args", {})
-        for part in (model, data):
+        for part in (self._get(self.config, "model"), self._get(self.config, "data").get("init_args", {})):
             if part.get("seed") == 0:  # the default: a seed that was asked for stays
                 part["seed"] = seed
 

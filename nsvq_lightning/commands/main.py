@@ -138,8 +138,7 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
         if not further[0].startswith("-"):
             parser.error(f"unknown argument {further[0]!r}; a list has commas between its entries, and no spaces")
         options.further = further  # for the commands that pass them on
-    logging.basicConfig(format="%(message)s")
-    logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
+    _show_log()
     try:
         return int(command.run(options))
     except argparse.ArgumentError as error:
@@ -183,6 +182,7 @@ def _run_lightning(arguments: list[str], own_process: bool) -> int:
     from lightning.fabric.utilities.exceptions import MisconfigurationException
     from lightning.pytorch.utilities.exceptions import SIGTERMException
 
+    _show_log()
     _quiet_lightning()
     if os.getcwd() not in sys.path:  # last, unlike `python -m`: for the user's own quantizers and callbacks
         sys.path.append(os.getcwd())
@@ -248,12 +248,16 @@ class BarHandler(logging.StreamHandler[TextIO]):
             self.handleError(record)
 
 
-def _quiet_lightning() -> None:
-    """Show our log messages, once; of Lightning's, only those that are not advertisements."""
-    from lightning.pytorch.utilities import rank_zero_only
-
+def _show_log() -> None:
+    """Show our log messages."""
     logging.basicConfig(format="%(message)s", handlers=[BarHandler()])
     logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
+
+
+def _quiet_lightning() -> None:
+    """Show messages once; of Lightning's, only those that are not advertisements."""
+    from lightning.pytorch.utilities import rank_zero_only
+
     for handler in logging.getLogger().handlers:
         # With several processes, only the first logs below warnings; each logs its own warnings and errors.
         handler.addFilter(lambda record: record.levelno >= logging.WARNING or getattr(rank_zero_only, "rank", 0) == 0)
