@@ -26,6 +26,7 @@ from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
 from nsvq_lightning.splats.attributes import SIZES
 
 if TYPE_CHECKING:
+    from nsvq_lightning.commands.compressor import Compressor
     from nsvq_lightning.compression.viewpoints import Measure
 
 DEFAULT_SIZE = "16k"
@@ -99,17 +100,18 @@ def run(options: argparse.Namespace) -> int:
         ValueError: The scene cannot be used, or a limit cannot be met.
         OSError: A file cannot be read or written.
     """
-    from nsvq_lightning.io.formats import read_scene, save, suffix_of
+    from nsvq_lightning.io.formats import read_scene, suffix_of
 
-    suffix = suffix_of(options.output)
-    if suffix not in (".nsvq", NAME):
-        message = f"{options.output}: the result is a .nsvq file or {NAME}; 'nsvq convert' writes other formats"
-        raise argparse.ArgumentError(None, message)
-    if suffix == NAME and (options.codebooks or options.max_error or options.target_bytes):
-        message = f"{NAME} has levels of detail (--levels), no codebooks and no limits"
-        raise argparse.ArgumentError(None, message)
-    if suffix != NAME and options.levels:
-        raise argparse.ArgumentError(None, f"--levels is for {NAME}, but the output is {options.output}")
+    streamed = suffix_of(options.output) == NAME
+    wrong = ""
+    if not streamed and suffix_of(options.output) != ".nsvq":
+        wrong = f"{options.output}: the result is a .nsvq file or {NAME}; 'nsvq convert' writes other formats"
+    elif streamed and (options.codebooks or options.max_error or options.target_bytes):
+        wrong = f"{NAME} has levels of detail (--levels), no codebooks and no limits"
+    elif options.levels and not streamed:
+        wrong = f"--levels is for {NAME}, but the output is {options.output}"
+    if wrong:
+        raise argparse.ArgumentError(None, wrong)
     scene = read_scene(options.input)
     most = splats_left(options.splats, len(scene))
     # What is impossible is said before the scene is looked at.
@@ -124,14 +126,28 @@ def run(options: argparse.Namespace) -> int:
     measure = Measure(splats, cameras, scene.antialiased)
     data = SceneDataModule(photos or own_scene(splats, cameras, scene.antialiased), options.seed)
     compressor = Compressor(scene, data, measure, Storage(options.level), options.seed, options.minutes, options.steps)
-    if suffix == NAME:
-        levels = [scene if most == len(scene) else compressor.at(Setting(most, "none")).scene]
-        for level in range(1, options.levels or LOD_LEVELS):
-            levels.append(compressor.at(Setting(max(1, most // 4**level), "none")).scene)
-        size = save(levels[0], options.output, coarser=levels[1:])
-        counts = ", ".join(f"{len(level):,}" for level in levels)
-        say(f"{options.output}: levels of {counts} splats, {size:,} bytes")
-        return 130 if compressor.stopped else 0
+    if streamed:
+        _write_levels(options, compressor, most)
+    else:
+        _write_file(options, compressor, most, "its own pictures" if photos is None else f"the photos of {photos.root}")
+    return 130 if compressor.stopped else 0
+
+
+def _write_levels(options: argparse.Namespace, compressor: "Compressor", most: int) -> None:
+    """Write a streamed SOG of levels of detail, the finest of ``most`` splats."""
+    from nsvq_lightning.io.formats import save
+
+    scene = compressor.scene
+    levels = [scene if most == len(scene) else compressor.at(Setting(most, "none")).scene]
+    for level in range(1, options.levels or LOD_LEVELS):
+        levels.append(compressor.at(Setting(max(1, most // 4**level), "none")).scene)
+    size = save(levels[0], options.output, coarser=levels[1:])
+    counts = ", ".join(f"{len(level):,}" for level in levels)
+    say(f"{options.output}: levels of {counts} splats, {size:,} bytes")
+
+
+def _write_file(options: argparse.Namespace, compressor: "Compressor", most: int, views: str) -> None:
+    """Write the ``.nsvq`` file of at most ``most`` splats that is asked for."""
     if options.max_error is not None:
         candidate = compressor.smallest_within(options.max_error, most)
     elif options.target_bytes is not None:
@@ -143,14 +159,11 @@ def run(options: argparse.Namespace) -> int:
     before, after = options.input.stat().st_size, len(candidate.data)
     sizes = candidate.setting.codebooks
     books = "no codebooks" if sizes == "none" else f"codebooks {sizes}"
-    views = "its own pictures" if photos is None else f"the photos of {photos.root}"
-    error = written_error(measure, compressor.error(candidate), "the original")
+    error = written_error(compressor.measure, compressor.error(candidate), "the original")
     say(
-        f"{options.output}: {len(candidate.scene):,} of {len(scene):,} splats in {after:,} bytes, "
+        f"{options.output}: {len(candidate.scene):,} of {len(compressor.scene):,} splats in {after:,} bytes, "
         f"{before / after:.1f} times smaller than {options.input.name}",
         f"  {books}, fitted to {views}, {error}",
     )
     if compressor.stopped:
         sys.stderr.write(f"Ctrl-C ended the training early: {options.output} holds what it had reached\n")
-        return 130
-    return 0

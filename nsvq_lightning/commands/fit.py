@@ -1,4 +1,4 @@
-"""LightningCLI with this package's module, data, callbacks and defaults, and its help."""
+"""``nsvq fit`` and its siblings: LightningCLI with this package's module, data, callbacks, defaults and run folder."""
 
 import json
 import math
@@ -94,16 +94,8 @@ PARSER_SETTINGS["fit"]["default_config_files"] = [find_config("fast")]
 
 
 # A gate that nobody passes would let a checkpoint import what it names.
-check_replaced(
-    "lightning",
-    LightningCLI,
-    "_get",
-    "_parse_ckpt_path",
-    "_parser",
-    "_prepare_subcommand_parser",
-    "_run_subcommand",
-    "_set_seed",
-)
+OVERRIDDEN = ("_get", "_parse_ckpt_path", "_parser", "_prepare_subcommand_parser", "_run_subcommand", "_set_seed")
+check_replaced("lightning", LightningCLI, *OVERRIDDEN)
 
 
 class SplatCLI(LightningCLI):

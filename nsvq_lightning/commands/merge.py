@@ -8,11 +8,17 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.split import RUN
+
+if TYPE_CHECKING:
+    from nsvq_lightning.data.blocks import Block
+    from nsvq_lightning.data.scene import Scene
+    from nsvq_lightning.io.compressed import CompressedScene
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,14 +34,10 @@ def run(options: argparse.Namespace) -> int:
         ValueError: The folder has no parts, a part is not trained yet, or nothing is left of it.
         OSError: A file cannot be read or written.
     """
-    import torch
-
-    from nsvq_lightning.data.blocks import BLOCK, Block, near_seams, points_in_front, shown
+    from nsvq_lightning.data.blocks import BLOCK, Block
     from nsvq_lightning.data.scene import load_scene
     from nsvq_lightning.io.compressed import CompressedScene
     from nsvq_lightning.io.formats import format_of, read_scene, save
-    from nsvq_lightning.quality.metrics import eight_bit, psnr
-    from nsvq_lightning.rendering.rasterize import render
 
     format_of(options.output)
     folders = [path.parent for path in options.parts.glob(f"*/{BLOCK}")]
@@ -59,6 +61,17 @@ def run(options: argparse.Namespace) -> int:
     scene = replace(CompressedScene.joined(parts), origin=photos.frame.origin)
     size = save(scene, options.output)
     say(f"{options.output}: {len(scene):,} splats in {size:,} bytes")
+    say(f"  test photos of {photos.root}: {_scores(scene, photos, blocks)}")
+    return 0
+
+
+def _scores(scene: "CompressedScene", photos: "Scene", blocks: "list[Block]") -> str:
+    """Mean PSNR of the test photos; where seams between parts are seen, also that of the pixels near them."""
+    import torch
+
+    from nsvq_lightning.data.blocks import near_seams, points_in_front, shown
+    from nsvq_lightning.quality.metrics import eight_bit, psnr
+    from nsvq_lightning.rendering.rasterize import render
 
     splats = scene.decode()
     points = photos.points.double().numpy()
@@ -75,8 +88,7 @@ def run(options: argparse.Namespace) -> int:
         for scores, mask in ((everywhere, counted), (at_seams, counted & seam), (elsewhere, counted & ~seam)):
             if mask.any():
                 scores.append(float(psnr(eight_bit(image), eight_bit(view.image), mask)))
-    found = f"  test photos of {photos.root}: {fmean(everywhere):.2f} dB"
-    if at_seams:  # where parts lie apart, no photo shows a seam
-        found += f"; at seams {fmean(at_seams):.2f} dB, elsewhere {fmean(elsewhere):.2f} dB"
-    say(found)
-    return 0
+    text = f"{fmean(everywhere):.2f} dB"
+    if at_seams and elsewhere:
+        text += f"; at seams {fmean(at_seams):.2f} dB, elsewhere {fmean(elsewhere):.2f} dB"
+    return text

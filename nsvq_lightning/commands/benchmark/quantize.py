@@ -65,14 +65,8 @@ def run(scope: Scope) -> Iterator[Measurement]:
     methods: dict[str, Callable[..., Results]] = {"NSVQ": step, "plain torch": partial(step, quantize=plain_nsvq)}
     errors = {method: step_errors(attributes, call(attributes, 0)) for method, call in methods.items()}
     steps = {method: lambda call=call: call(attributes, next(clock)) for method, call in methods.items()}
-    yield from compare(
-        STEP,
-        f"{workload.name}, {scope.codebooks} codebooks",
-        steps,
-        errors,
-        scope,
-        prepare=lambda: _advance(attributes, next(clock)),
-    )
+    described = f"{workload.name}, {scope.codebooks} codebooks"
+    yield from compare(STEP, described, steps, errors, scope, prepare=lambda: _advance(attributes, next(clock)))
 
 
 def prepare(splats: RawSplats, codebooks: str) -> dict[str, Attribute]:
