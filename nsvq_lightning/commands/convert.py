@@ -29,14 +29,6 @@ from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.sog import PALETTE_LIMIT
 from nsvq_lightning.splats.conventions import Float64s
 
-# Formats that have an option of the writer; the first is named where another one is given.
-WRITER_OPTIONS = {
-    "level": (".nsvq",),
-    "palette": (".sog", lod.NAME),
-    "spz_version": (".spz",),
-    "spz_axes": (".spz",),
-}
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what ``nsvq convert`` takes."""
@@ -102,6 +94,15 @@ def run(options: argparse.Namespace) -> int:
     if options.measure:
         _measure(options.inputs[0], output, options.root)
     return 0
+
+
+# Formats that have an option of the writer; the first is named where another one is given.
+WRITER_OPTIONS = {
+    "level": (".nsvq",),
+    "palette": (".sog", lod.NAME),
+    "spz_version": (".spz",),
+    "spz_axes": (".spz",),
+}
 
 
 def _contradiction(options: argparse.Namespace) -> str:

@@ -17,6 +17,8 @@ from nsvq_lightning.top_level import folder_of
 if TYPE_CHECKING:
     from yaml.nodes import Node
 
+# What ``nsvq fit --help`` prints without Lightning, whose import takes seconds; a test compares it with its parser.
+FIT_HELP = Path(__file__).with_name("fit_help.txt")
 CONFIG = "--config="
 BUDGET = "--callbacks.budget"
 
@@ -74,9 +76,7 @@ def expand(arguments: Sequence[str]) -> list[str]:
     return sorted(expanded, key=lambda each: (each.startswith("--"), not each.startswith(CONFIG)))
 
 
-# What ``nsvq fit --help`` prints without Lightning, whose import takes seconds; a test compares it with its parser.
-FIT_HELP = Path(__file__).with_name("fit_help.txt")
-# Whose options are in it; another version may have others, which its parser knows.
+# Whose options are in that help; another version may have others, which its parser knows.
 FIT_HELP_OF = {"lightning": "2.6.6", "jsonargparse": "4.53.0"}
 
 

@@ -21,6 +21,9 @@ from nsvq_lightning.training.optim import LearningRates
 STEP = "step, forward + backward"
 SEARCH = "search"
 
+# Quantized rows ``[V, D]``, their gradient by the rows ``[N, D]``, and codes ``[V]`` by attribute.
+Results = dict[str, tuple[Tensor, Tensor, Tensor]]
+
 
 class Attribute(NamedTuple):
     """One quantized attribute in the middle of training.
@@ -38,10 +41,6 @@ class Attribute(NamedTuple):
     rows: Tensor
     upstream: Tensor
     rate: float
-
-
-# Quantized rows ``[V, D]``, their gradient by the rows ``[N, D]``, and codes ``[V]`` by attribute.
-Results = dict[str, tuple[Tensor, Tensor, Tensor]]
 
 
 def run(scope: Scope) -> Iterator[Measurement]:

@@ -25,6 +25,11 @@ FORWARD = "forward"
 BOTH = "forward + backward"
 LOSS = "L1 + D-SSIM, forward + backward"
 
+# An image with a graph behind it, and the splats at its other end.
+Traced = tuple[Tensor, RawSplats]
+# Renders splats as the camera of a workload sees them: image ``[H, W, 3]``.
+Painter = Callable[[RawSplats, Workload], Tensor]
+
 
 def run(scope: Scope) -> Iterator[Measurement]:
     """Time every back-end of every device on every workload; errors once a workload."""
@@ -32,12 +37,6 @@ def run(scope: Scope) -> Iterator[Measurement]:
         for workload in workloads(scope):
             yield from _render_rows(workload.to(device), scope, device)
         yield from _loss_rows(scope, device)
-
-
-# An image with a graph behind it, and the splats at its other end.
-Traced = tuple[Tensor, RawSplats]
-# Renders splats as the camera of a workload sees them: image ``[H, W, 3]``.
-Painter = Callable[[RawSplats, Workload], Tensor]
 
 
 def painter(backend: str) -> Painter:

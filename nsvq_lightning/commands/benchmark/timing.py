@@ -19,6 +19,9 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.report.numbers import markdown_table
 from nsvq_lightning.version import __version__
 
+# What is timed.
+Call = Callable[[], object]
+
 
 @dataclass(frozen=True)
 class Scope:
@@ -87,10 +90,6 @@ class Measurement:
     def ratio(self) -> float:
         """Median as a multiple of the median matrix product: comparable between machines and between busy hours."""
         return self.median / statistics.median(self.sgemm)
-
-
-# What is timed.
-Call = Callable[[], object]
 
 
 def compare(

@@ -16,6 +16,8 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats.conventions import Float64s
 from nsvq_lightning.splats.splats import RawSplats, Splats, detached
 
+SEED = 7
+
 
 @dataclass(frozen=True, eq=False)
 class Workload:
@@ -95,9 +97,6 @@ def workloads(scope: Scope) -> list[Workload]:
         scene = scene.standard
         splats = detached(Splats.from_points(scene.points, scene.colors, sh_degree=3))
     return [_seen_by(scene.cameras[scene.train[0]], splats, name)]
-
-
-SEED = 7
 
 
 def synthetic_workload(name: str) -> Workload:
