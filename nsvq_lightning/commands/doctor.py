@@ -235,6 +235,8 @@ def _range(sizes: Collection[tuple[int, int]]) -> str:
 
 def check_points(model: "ColmapModel") -> Iterator[Finding]:
     """Number of points, and outliers."""
+    from nsvq_lightning.rendering.frame import middle_of
+
     count = len(model.points)
     if not count:
         text = f"none in {model.source}: random ones take their place, and training has more to do"
@@ -246,10 +248,9 @@ def check_points(model: "ColmapModel") -> Iterator[Finding]:
         program = "COLMAP" if model.source == "COLMAP" else "the export"
         yield Finding("problem", "points", f"none is finite: run {program} again")
         return
-    distances = np.linalg.norm(finite - np.median(finite, axis=0), axis=1)
-    # Ten times farther from the median than four fifths of the points.
-    usual = max(float(np.quantile(distances, 0.8)), 1e-12)
-    far = float(np.mean(distances > 10.0 * usual))
+    middle, usual = middle_of(finite)
+    # Ten times farther from the middle than four fifths of the points.
+    far = float(np.mean(np.linalg.norm(finite - middle, axis=1) > 10.0 * max(usual, 1e-12)))
     text = f"{count:,}, {100 * far:.2g} % far outliers"
     if len(finite) < count:
         text += f", {count - len(finite)} not finite (left out)"

@@ -13,10 +13,10 @@ from nsvq_lightning.data.images import ImageStore, Picture
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
-from nsvq_lightning.rendering.frame import EXTENT, Frame
+from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
 from nsvq_lightning.rendering.poses import poses, view_towards
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.conventions import Float32s, Float64s
+from nsvq_lightning.splats.conventions import Float64s
 from nsvq_lightning.splats.splats import SplatTensors
 
 # Near plane of a guessed camera, as a share of the distance to what it looks at.
@@ -37,13 +37,6 @@ def look_at(target: Float64s, eye: Float64s, width: int, height: int, angle: flo
     focal = 0.5 * width / math.tan(angle / 2)
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
     return Camera(intrinsics, view, width, height, NEARNESS * float(np.linalg.norm(target - eye)) or NEAR)
-
-
-def middle_of(means: Float32s) -> tuple[Float64s, float]:
-    """The median ``[3]`` of positions ``[N, 3]``, N > 0, and the distance from it within which four fifths lie."""
-    points = means.astype(np.float64)
-    middle = np.median(points, axis=0)
-    return middle, float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.8)) or 1.0
 
 
 @torch.no_grad()
@@ -113,9 +106,10 @@ def own_scene(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool
     """
     photos = ((255 * picture).round().to(torch.uint8) for picture in pictures(splats, cameras, antialiased))
     centres = poses(cameras)[0]
-    frame = (
-        Frame.around(centres) if np.ptp(centres, axis=0).any() else Frame(middle_of(splats.means.numpy())[1] / EXTENT)
-    )
+    frame = Frame.around(centres)
+    if not np.ptp(centres, axis=0).any():
+        _, reach = middle_of(splats.means.numpy())
+        frame = Frame((reach or 1.0) / EXTENT)
     return Scene(
         root=Path("own pictures"),
         names=tuple(f"{number:03d}" for number in range(len(cameras))),

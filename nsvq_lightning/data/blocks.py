@@ -8,7 +8,7 @@ and masks leave out what is in front of it or behind: no splat is spent on that,
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from nsvq_lightning.data.colmap import SceneError
+from nsvq_lightning.data.points import projected
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import write_bytes, write_text
 from nsvq_lightning.io.placing import turn_up
@@ -78,17 +79,15 @@ def points_in_front(points: Float64s, camera: Camera) -> _Front:
 
     Cells are numbered row by row.
     """
-    view = camera.viewmat.double().numpy()
-    x, y, z = (points @ view[:3, :3].T + view[:3, 3]).T
-    fx, fy, cx, cy = camera.intrinsics
     columns, rows, size = _cells(camera)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        column, row = np.floor((fx * x / z + cx) / size), np.floor((fy * y / z + cy) / size)
-    seen = np.flatnonzero((z > 0) & (column >= 0) & (column < columns) & (row >= 0) & (row < rows))
+    column, row, depth = projected(points, camera)
+    column = np.floor(column / size)
+    row = np.floor(row / size)
+    seen = np.flatnonzero((column >= 0) & (column < columns) & (row >= 0) & (row < rows))
     cells = (row[seen] * columns + column[seen]).astype(np.intp)
     nearest = np.full(columns * rows, np.inf)
-    np.minimum.at(nearest, cells, z[seen])
-    front = z[seen] <= FRONT * nearest[cells]
+    np.minimum.at(nearest, cells, depth[seen])
+    front = depth[seen] <= FRONT * nearest[cells]
     return seen[front], cells[front]
 
 
@@ -102,11 +101,10 @@ def _cells(camera: Camera) -> tuple[int, int, int]:
     return math.ceil(camera.width / size), math.ceil(camera.height / size), size
 
 
-# Surroundings of a core beyond each seam, as a share of what photos show of the part, and of its width at most; and how
-# far the seam may move from where both sides have their share, to lie in the widest gap.
-OVERLAP, SLACK = 0.15, 0.1
-
-
+# Surroundings of a core beyond each seam, as a share of what photos show of the part, and of its width at most.
+OVERLAP = 0.15
+# How far the seam may move from where both sides have their share, to lie in the widest gap.
+SLACK = 0.1
 # Where a part without a neighbour ends.
 _FAR = 1e30
 
@@ -134,20 +132,27 @@ def cut(scene: Scene, count: int) -> list[Block]:
         if number == 1:
             return [Block(axes.tolist(), core.tolist(), around.tolist(), root)]
         spread = [np.subtract(*_quantiles(column, weights, (0.95, 0.05))) for column in places.T]
-        axis, first = int(np.argmax(spread)), number // 2
+        axis = int(np.argmax(spread))
+        along = places[:, axis]
+        first = number // 2
         shares = np.array([first - OVERLAP, first - SLACK, first + SLACK, first + OVERLAP]) / number
-        lower, start, stop, upper = _quantiles(places[:, axis], weights, shares)
-        near = np.sort(places[(places[:, axis] >= start) & (places[:, axis] <= stop), axis])
+        lower, start, stop, upper = _quantiles(along, weights, shares)
+        near = np.sort(along[(along >= start) & (along <= stop)])
         gap = int(np.diff(near, append=near[-1]).argmax())
         seam = near[gap : gap + 2].mean()
         reach = OVERLAP * spread[axis] / number
-        found = []
-        for below, end in ((True, min(upper, seam + reach)), (False, max(lower, seam - reach))):
-            side = some & ((ground[:, axis] < seam) == below)
-            inner, outer = core.copy(), around.copy()
-            inner[int(below), axis], outer[int(below), axis] = seam, end
-            found += parts(side, inner, outer, first if below else number - first)
-        return found
+        below = ground[:, axis] < seam
+
+        def side(inside: Bools, bound: int, end: float, share: int) -> list[Block]:
+            """The parts on one side of the seam, where the core has this bound and its surroundings have an end."""
+            inner = core.copy()
+            inner[bound, axis] = seam
+            outer = around.copy()
+            outer[bound, axis] = end
+            return parts(some & inside, inner, outer, share)
+
+        low = side(below, 1, min(upper, seam + reach), first)
+        return low + side(~below, 0, max(lower, seam - reach), number - first)
 
     everywhere = np.array([[-_FAR] * 2, [_FAR] * 2])
     return parts(np.ones(len(points), bool), everywhere, everywhere, count)
@@ -168,9 +173,29 @@ def near_seams(points: Float64s, blocks: Sequence[Block]) -> Bools:
     return np.asarray(sum(block.contains(points, _SEAM).astype(int) for block in blocks) > 1)
 
 
+# A point in a file: its position, then its colour.
 _POINT = [(axis, "<f4") for axis in "xyz"] + [(color, "u1") for color in ("red", "green", "blue")]
 # A photo belongs to a part if it shows it in this share of its cells.
-LEAST_SHOWN = 0.05
+MIN_SHOWN = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A part that is being written.
+
+    Attributes:
+        block: The part.
+        folder: Where to.
+        inside: Which points of the scene are in it or in its surroundings ``[P]``.
+        train: Its train photos, as frames of ``transforms.json``.
+        test: Its test photos.
+    """
+
+    block: Block
+    folder: Path
+    inside: Bools
+    train: list[dict[str, Any]] = field(default_factory=list)
+    test: list[dict[str, Any]] = field(default_factory=list)
 
 
 def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path]) -> list[tuple[int, int]]:
@@ -186,38 +211,37 @@ def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path])
         OSError: A file cannot be written.
     """
     points = scene.points.double().numpy()
-    inside = [block.contains(points, 1.0) for block in blocks]
-    frames: list[dict[str, list[dict[str, Any]]]] = [{"train": [], "test": []} for _ in blocks]
-    for index in range(len(scene)):
-        camera, picture = scene.cameras[index], None
+    parts = [_Part(block, folder, block.contains(points, 1.0)) for block, folder in zip(blocks, folders, strict=True)]
+    for index, camera in enumerate(scene.cameras):
         front = points_in_front(points, camera)
-        for number, folder in enumerate(folders):
-            mask = shown(front, inside[number], camera)
-            if mask.mean() < LEAST_SHOWN:
-                continue
-            picture = scene.images[index] if picture is None else picture
-            if picture.mask is not None:
-                mask &= picture.mask.numpy()
-            if not mask.any():
-                continue
-            entry = _write_photo(folder, index, picture.image.numpy(), mask, camera)
-            frames[number]["test" if index in scene.test else "train"].append(entry)
-    for block, folder, some, found in zip(blocks, folders, inside, frames, strict=True):
-        if not found["train"] or not found["test"]:
-            train, test = len(found["train"]), len(found["test"])
+        masks = [shown(front, part.inside, camera) for part in parts]
+        showing = [(part, mask) for part, mask in zip(parts, masks, strict=True) if mask.mean() >= MIN_SHOWN]
+        if not showing:
+            continue
+        image, counting = scene.images[index]
+        for part, mask in showing:
+            if counting is not None:
+                mask &= counting.numpy()
+            if mask.any():
+                frame = _write_photo(part.folder, index, image.numpy(), mask, camera)
+                (part.test if index in scene.test else part.train).append(frame)
+    colors = np.rint(255 * scene.colors.numpy())
+    for part in parts:
+        train, test = len(part.train), len(part.test)
+        if not train or not test:
             raise SceneError(f"a part is in {train} train and {test} test photos: ask for fewer parts")
-        # Positions, then colours.
-        columns = [*points[some].T, *np.rint(255 * scene.colors.numpy()[some]).T]
-        write_elements(folder / "points.ply", {"vertex": np.rec.fromarrays(columns, dtype=_POINT)})
+        columns = [*points[part.inside].T, *colors[part.inside].T]
+        write_elements(part.folder / "points.ply", {"vertex": np.rec.fromarrays(columns, dtype=_POINT)})
         model = {
             "camera_model": "PINHOLE",
             "ply_file_path": "points.ply",
-            "frames": [*found["train"], *found["test"]],
-            **{f"{split}_filenames": [frame["file_path"] for frame in found[split]] for split in found},
+            "frames": part.train + part.test,
+            "train_filenames": [frame["file_path"] for frame in part.train],
+            "test_filenames": [frame["file_path"] for frame in part.test],
         }
-        write_text(folder / "transforms.json", json.dumps(model, indent=1))
-        write_text(folder / BLOCK, json.dumps(asdict(block), indent=1))
-    return [(len(found["train"]), len(found["test"])) for found in frames]
+        write_text(part.folder / "transforms.json", json.dumps(model, indent=1))
+        write_text(part.folder / BLOCK, json.dumps(asdict(part.block), indent=1))
+    return [(len(part.train), len(part.test)) for part in parts]
 
 
 def shown(front: _Front, inside: Bools, camera: Camera) -> Bools:
@@ -228,15 +252,19 @@ def shown(front: _Front, inside: Bools, camera: Camera) -> Bools:
         inside: Which of all points ``[P]``.
         camera: Camera of the picture.
     """
-    (points, cells), (columns, rows, size) = front, _cells(camera)
-    counts = np.bincount(cells, minlength=columns * rows)
-    here = np.bincount(cells[inside[points]], minlength=columns * rows) > 0
+    points, cells = front
+    columns, rows, size = _cells(camera)
+    empty = np.ones((rows, columns), bool)
+    empty.flat[cells] = False
+    here = np.zeros((rows, columns), np.uint8)
+    here.flat[cells[inside[points]]] = 1
     if not here.any():
         return np.zeros((camera.height, camera.width), bool)
     # A cell without points shows what the nearest one with points does.
-    nearest = distance_transform_edt(counts.reshape(rows, columns) == 0, return_distances=False, return_indices=True)
-    grid = cv2.dilate(here.reshape(rows, columns)[tuple(nearest)].astype(np.uint8), np.ones((3, 3), np.uint8))
-    return np.kron(grid, np.ones((size, size), np.uint8))[: camera.height, : camera.width].astype(bool)
+    nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
+    grid = cv2.dilate(here[tuple(nearest)], np.ones((3, 3), np.uint8))
+    pixels = grid.repeat(size, axis=0).repeat(size, axis=1)
+    return np.asarray(pixels[: camera.height, : camera.width], bool)
 
 
 def _write_photo(folder: Path, index: int, image: Uint8s, mask: Bools, camera: Camera) -> dict[str, Any]:
@@ -244,14 +272,27 @@ def _write_photo(folder: Path, index: int, image: Uint8s, mask: Bools, camera: C
     top, bottom = np.flatnonzero(mask.any(1))[[0, -1]]
     left, right = np.flatnonzero(mask.any(0))[[0, -1]]
     box = slice(top, bottom + 1), slice(left, right + 1)
-    names = {"file_path": f"images/{index:05}.png", "mask_path": f"masks/{index:05}.png"}
-    for name, pixels in zip(names.values(), (image[box][..., ::-1], 255 * mask[box].astype(np.uint8)), strict=True):
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, cv2.imencode(".png", np.ascontiguousarray(pixels))[1].tobytes())
+    photo = f"images/{index:05}.png"
+    _write_png(folder / photo, image[box][..., ::-1])
+    kept = f"masks/{index:05}.png"
+    _write_png(folder / kept, 255 * mask[box].astype(np.uint8))
     fx, fy, cx, cy = camera.intrinsics
     height, width = mask[box].shape
     # The file has the inverse, y up, z backward.
-    pose = np.linalg.inv(camera.viewmat.double().numpy()) * np.array([1, -1, -1, 1])
-    lens = {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx - float(left), "cy": cy - float(top)}
-    return names | lens | {"transform_matrix": pose.tolist()}
+    pose = np.linalg.inv(camera.viewmat.double().numpy()) * (1, -1, -1, 1)
+    return {
+        "file_path": photo,
+        "mask_path": kept,
+        "w": width,
+        "h": height,
+        "fl_x": fx,
+        "fl_y": fy,
+        "cx": cx - float(left),
+        "cy": cy - float(top),
+        "transform_matrix": pose.tolist(),
+    }
+
+
+def _write_png(path: Path, pixels: Uint8s) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, cv2.imencode(".png", np.ascontiguousarray(pixels))[1].tobytes())

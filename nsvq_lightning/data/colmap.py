@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence, Sized
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePath
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import cv2  # noqa: F401  (before pycolmap, see import_pycolmap)
 import numpy as np
@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.data import NO_FOLDER
 from nsvq_lightning.data import colmap_tables as tables
-from nsvq_lightning.data.pinhole import Pinhole
 from nsvq_lightning.splats.conventions import Float64s, Int64s, Uint8s
 
 log = logging.getLogger(__name__)
@@ -30,9 +29,9 @@ class SceneError(ValueError):
 
 
 # Pixels; a camera with a larger side is damaged.
-LARGEST_SIDE = (1 << 20) - 1
+MAX_SIDE = (1 << 20) - 1
 # Upper bound on poses and intrinsics: their squares, which rendering computes in float32, stay finite.
-LARGEST = 1e18
+MAX_NUMBER = 1e18
 # Relative error of a quaternion's length that comes from writing its numbers with few digits.
 _ROUNDED = 1e-4
 
@@ -60,12 +59,44 @@ class ColmapImage:
 
 
 @dataclass(frozen=True, eq=False)
+class Pinhole:
+    """A camera without distortion, with the names of ``pycolmap.Camera``, whose place it takes.
+
+    Attributes:
+        K: ``[3, 3]`` float64, pixels, centres at .5.
+        width: Pixels.
+        height: Pixels.
+        camera_id: Number of the camera; 0 where it has none.
+    """
+
+    K: Float64s
+    width: int
+    height: int
+    camera_id: int = 0
+    model_name: ClassVar[str] = "PINHOLE"
+
+    def calibration_matrix(self) -> Float64s:
+        """``K``."""
+        return self.K
+
+    def scaled(self, across: float, down: float) -> "Pinhole":
+        """The camera of the image made so many times as wide and as high, rounded to pixels, at least one.
+
+        With centres at .5, the whole of ``K`` scales linearly.
+        """
+        width = max(1, round(self.width * across))
+        height = max(1, round(self.height * down))
+        scale = np.diag([width / self.width, height / self.height, 1.0])
+        return Pinhole(scale @ self.K, width, height)
+
+
+@dataclass(frozen=True, eq=False)
 class ColmapModel:
     """A COLMAP reconstruction in COLMAP's own world frame, or the cameras of a transforms file as if they were one.
 
     Attributes:
         images: Registered images, sorted by name.
-        cameras: ``pycolmap.Camera`` by id, of those without distortion :class:`~nsvq_lightning.data.pinhole.Pinhole`.
+        cameras: ``pycolmap.Camera`` by id, of those without distortion :class:`Pinhole`.
         points: Sparse points ``[P, 3]`` float64, scene units, sorted by COLMAP's point id; maybe none.
         colors: Their colours ``[P, 3]`` uint8 RGB.
         observations: Row of the point and row of the image of each sighting ``[O, 2]`` int64; None unless requested.
@@ -157,8 +188,7 @@ def _tables_in(folder: Path) -> dict[str, Path] | None:
         {table: there[table.lower() + suffix] for table in TABLES if table.lower() + suffix in there}
         for suffix in (".bin", ".txt")
     )
-    whole = [files for files in (binary, text) if len(files) == len(TABLES)]
-    files = whole[0] if whole else text | binary
+    files = text if len(binary) < len(text) == len(TABLES) else text | binary
     return files if {"cameras", "images"} <= files.keys() else None
 
 
@@ -257,9 +287,10 @@ def _viewmats(rows: Sequence[tables.ImageRow], path: Path) -> Float64s:
     Raises:
         SceneError: A pose is not finite or its quaternion is 0, or a photo has two poses.
     """
-    quats, places = np.array([row.quat for row in rows]), np.array([row.translation for row in rows])
+    quats = np.array([row.quat for row in rows])
+    places = np.array([row.translation for row in rows])
     norms = np.linalg.norm(quats, axis=1)
-    usable = (norms > 0) & (np.abs(np.c_[quats, places]) <= LARGEST).all(1)
+    usable = (norms > 0) & (np.abs(np.c_[quats, places]) <= MAX_NUMBER).all(1)
     if not usable.all():
         first = rows[int(usable.argmin())]
         pose = f"quaternion {list(first.quat)} and translation {list(first.translation)}"
@@ -288,18 +319,19 @@ def _camera(row: tables.CameraRow, path: Path) -> Any:
     Raises:
         SceneError: It is damaged.
     """
-    side, params = (row.width, row.height), np.array(row.params)
-    if not 0 < min(side) <= max(side) <= LARGEST_SIDE or not (np.abs(params) <= LARGEST).all() or not params[0] > 0:
+    has_sides = all(0 < side <= MAX_SIDE for side in (row.width, row.height))
+    is_usable = has_sides and (np.abs(row.params) <= MAX_NUMBER).all() and row.params[0] > 0
+    if not is_usable:
         raise SceneError(
             f"{path}: camera {row.number} has size {row.width}x{row.height} and parameters "
-            f"{', '.join(map(str, row.params))}; needed are sizes from 1 to {LARGEST_SIDE}, finite numbers and a focal "
+            f"{', '.join(map(str, row.params))}; needed are sizes from 1 to {MAX_SIDE}, finite numbers and a focal "
             "length above 0: copy the model again or run COLMAP again"
         )
-    return lens(row.number, row.model, row.width, row.height, row.params)
+    return lens(*row)
 
 
 def lens(number: int, model: str, width: int, height: int, params: tuple[float, ...]) -> Any:
-    """A camera: :class:`~nsvq_lightning.data.pinhole.Pinhole` without distortion, else a ``pycolmap.Camera``.
+    """A camera: :class:`Pinhole` without distortion, else a ``pycolmap.Camera``.
 
     Args:
         number: Its identifier.
@@ -312,7 +344,9 @@ def lens(number: int, model: str, width: int, height: int, params: tuple[float, 
         SceneError: It has distortion, and pycolmap is not installed.
     """
     if model in ("PINHOLE", "SIMPLE_PINHOLE"):
-        return Pinhole.of(params, width, height, number)
+        *focal, cx, cy = params
+        K = np.array([[focal[0], 0, cx], [0, focal[-1], cy], [0, 0, 1]], np.float64)
+        return Pinhole(K, width, height, number)
     pycolmap = import_pycolmap()
     return pycolmap.Camera(model=model, width=width, height=height, params=list(params), camera_id=number)
 

@@ -1,19 +1,17 @@
 """Points where the photos have detail, from the optical flow between neighbouring train photos."""
 
-from concurrent.futures import ThreadPoolExecutor
+import itertools
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
-from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.edges import edges_of
-from nsvq_lightning.data.images import resized_mask
-from nsvq_lightning.data.scene import Scene
+from nsvq_lightning.data.images import resized
+from nsvq_lightning.data.scene import Scene, in_parallel
 from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Uint8s
 
@@ -37,13 +35,14 @@ class _Photo(NamedTuple):
 
     def project(self, points: Float64s) -> tuple[Float64s, Float64s]:
         """Pixels ``[M, 2]`` and depths ``[M]`` of points ``[M, 3]``."""
-        x = (points - self.position) @ self.rotation.T
-        return x[:, :2] / x[:, 2:] * self.focal + self.centre, x[:, 2]
+        local = (points - self.position) @ self.rotation.T
+        return local[:, :2] / local[:, 2:] * self.focal + self.centre, local[:, 2]
 
     def rays(self, pixels: Float64s) -> Float64s:
         """Unit directions ``[M, 3]`` in the world of pixels ``[M, 2]``."""
         local = np.concatenate([(pixels - self.centre) / self.focal, np.ones((len(pixels), 1))], 1)
-        return np.asarray(local / np.linalg.norm(local, axis=1, keepdims=True) @ self.rotation, np.float64)
+        rays: Float64s = local / np.linalg.norm(local, axis=1, keepdims=True) @ self.rotation
+        return rays
 
 
 # Triangulated pixels: positions ``[M, 3]``, colours ``[M, 3]`` and detail ``[M]``, both in bytes.
@@ -51,11 +50,13 @@ _Points = tuple[Float64s, Uint8s, Uint8s]
 
 
 # Candidates over all flows; of more pixels than that, every third, fourth, ... row and column is taken.
-MOST_CANDIDATES = 12_000_000
+MAX_CANDIDATES = 12_000_000
 # Edge of a cell over the median depth of the scene, and how many flows must find something in it.
-CELL, AGREEING = 0.01, 3
+CELL = 0.01
+MIN_AGREEING = 3
 # Detail of a flat pixel; and by which power of the number of points in its cell a point counts less.
-LEAST_DETAIL, CROWDED = 0.05, 0.7
+MIN_DETAIL = 0.05
+CROWDED = 0.7
 
 
 def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
@@ -82,33 +83,29 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # with several, DIS works in stripes, and its bits depend on how many
     try:
-        with ThreadPoolExecutor(usable_cores()) as pool:
-            looked = pool.map(lambda index: _photo(scene, index, known), scene.train)
-            photos = list(tqdm(looked, "dense start: photos", len(scene.train), leave=False, disable=None))
-            pairs = _neighbours(photos)
-            pixels = 2 * len(pairs) * photos[0].grey.size
-            stride = max(2, int(np.ceil(np.sqrt(pixels / MOST_CANDIDATES))))
-            flows = pool.map(lambda pair: _triangulated(pair, stride), pairs)
-            bar = tqdm(flows, "dense start: flows", len(pairs), leave=False, disable=None)
-            found = [each for two in bar for each in two]
+        photos = in_parallel(lambda index: _photo(scene, index, known), scene.train, "dense start: photos")
+        pairs = _neighbours(photos)
+        pixels = 2 * len(pairs) * photos[0].grey.size
+        stride = max(2, int(np.ceil(np.sqrt(pixels / MAX_CANDIDATES))))
+        found = in_parallel(lambda pair: _triangulated(*pair, stride), pairs, "dense start: flows")
     finally:
         cv2.setNumThreads(threads)
     if not found:
         return torch.empty(0, 3), torch.empty(0, 3)
     edge = CELL * np.median([photo.depth for photo in photos])
     del photos, pairs
-    positions, colors, detail = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    positions, colors, detail = (np.concatenate(parts) for parts in zip(*itertools.chain(*found), strict=True))
     found.clear()
     # Cells by one number each: 2^21 along an axis.
     cells = np.zeros(len(positions), np.int64)
     for axis in positions.T:
         cells = cells << 21 | np.floor(axis / edge).astype(np.int64) & (1 << 21) - 1
-    _, cell, crowd = np.unique(cells, return_inverse=True, return_counts=True)
-    crowd = crowd[cell]
-    weight = np.where(crowd >= AGREEING, (detail / 255 + LEAST_DETAIL) / crowd**CROWDED, 0)
+    _, cell, counts = np.unique(cells, return_inverse=True, return_counts=True)
+    crowd = counts[cell]
+    weight = np.where(crowd >= MIN_AGREEING, (detail / 255 + MIN_DETAIL) / crowd**CROWDED, 0)
     drawn = draw_rows(torch.from_numpy(weight), count, generator(seed, 0, "dense start")).numpy()
     chosen = torch.from_numpy(positions[drawn]).float(), torch.from_numpy(colors[drawn]).float() / 255
-    del positions, colors, detail, cells, cell, crowd, weight
+    del positions, colors, detail, cells, cell, counts, crowd, weight
     trim()
     return chosen
 
@@ -118,91 +115,106 @@ LONGEST = 800
 
 
 def _photo(scene: Scene, index: int, known: Float64s) -> _Photo:
-    camera, (image, mask) = scene.cameras[index], scene.images[index]
+    camera = scene.cameras[index]
+    image, mask = scene.images[index]
     scale = min(1.0, LONGEST / max(camera.width, camera.height))
     width, height = round(camera.width * scale), round(camera.height * scale)
-    pixels, counts = image.numpy(), None if mask is None else mask.numpy()
-    if scale < 1:
-        pixels = np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-        if counts is not None:
-            counts = resized_mask(counts, (width, height))
+    pixels, counts = resized(image.numpy(), None if mask is None else mask.numpy(), (width, height))
+    edges = edges_of(torch.from_numpy(pixels), None if counts is None else torch.from_numpy(counts))
     view = camera.viewmat.numpy().astype(np.float64)
     rotation, translation = view[:3, :3], view[:3, 3]
     size = np.array([width / camera.width, height / camera.height])
-    fx, fy, cx, cy = camera.intrinsics
     depths = known @ rotation[2] + translation[2]
-    edges = edges_of(torch.from_numpy(pixels), None if counts is None else torch.from_numpy(counts))
+    ahead = depths[depths > 0]
     return _Photo(
         image=pixels,
-        grey=np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8),
-        detail=np.asarray(cv2.GaussianBlur((edges.strength() * 255).byte().numpy(), (0, 0), 1.5), np.uint8),
+        grey=cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY),
+        detail=cv2.GaussianBlur((edges.strength() * 255).byte().numpy(), (0, 0), 1.5),
         counts=counts,
-        focal=size * (fx, fy),
-        centre=size * (cx, cy),
+        focal=size * camera.intrinsics[:2],
+        centre=size * camera.intrinsics[2:],
         rotation=rotation,
         position=-rotation.T @ translation,
-        depth=float(np.median(depths[depths > 0])) if (depths > 0).any() else 0.0,
+        depth=float(np.median(ahead)) if len(ahead) else 0.0,
     )
 
 
-# Distance of the cameras over the depth of what they see, angle between their axes in degrees, how many for a photo.
-BASELINE, MOST_TURNED, NEIGHBOURS = (0.02, 0.35), 25.0, 3
+# Least and largest distance of two cameras over the depth of what the first one sees.
+BASELINE = (0.02, 0.35)
+# Largest angle between their axes in degrees.
+MAX_TURNED = 25.0
+# Largest number of neighbours of a photo.
+MAX_NEIGHBOURS = 3
 
 
 def _neighbours(photos: list[_Photo]) -> list[tuple[_Photo, _Photo]]:
     """Each photo with those nearest to it that see the same from another place, each pair once."""
-    positions, axes = np.array([photo.position for photo in photos]), np.array([photo.rotation[2] for photo in photos])
+    positions = np.array([photo.position for photo in photos])
+    axes = np.array([photo.rotation[2] for photo in photos])
     pairs = set()
     for i, photo in enumerate(photos):
         base = np.linalg.norm(positions - photo.position, axis=1)
         angle = np.degrees(np.arccos(np.clip(axes @ axes[i], -1, 1)))
-        usable = (base > BASELINE[0] * photo.depth) & (base < BASELINE[1] * photo.depth) & (angle < MOST_TURNED)
+        least, largest = (share * photo.depth for share in BASELINE)
+        usable = (base > least) & (base < largest) & (angle < MAX_TURNED)
         nearest = np.argsort(np.where(usable, base + 0.01 * photo.depth * angle, np.inf), kind="stable")
-        pairs |= {(min(i, j), max(i, j)) for j in nearest[: min(NEIGHBOURS, usable.sum())].tolist()}
+        for j in nearest[: min(MAX_NEIGHBOURS, usable.sum())].tolist():
+            pairs.add((min(i, j), max(i, j)))
     return [(photos[i], photos[j]) for i, j in sorted(pairs)]
 
 
-def _triangulated(pair: tuple[_Photo, _Photo], stride: int) -> list[_Points]:
+def _triangulated(a: _Photo, b: _Photo, stride: int) -> list[_Points]:
     """What two photos show of each other: the pixels of the first, then those of the second."""
-    a, b = pair
     height, width = np.maximum(a.grey.shape, b.grey.shape)
-    grey = [
-        cv2.copyMakeBorder(p.grey, 0, height - p.grey.shape[0], 0, width - p.grey.shape[1], cv2.BORDER_REPLICATE)
-        for p in pair
-    ]
+    first, second = (
+        cv2.copyMakeBorder(grey, 0, height - grey.shape[0], 0, width - grey.shape[1], cv2.BORDER_REPLICATE)
+        for grey in (a.grey, b.grey)
+    )
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    there, back = dis.calc(grey[0], grey[1], None), dis.calc(grey[1], grey[0], None)
+    there = dis.calc(first, second, None)
+    back = dis.calc(second, first, None)
     return [_followed(a, b, there, back, stride), _followed(b, a, back, there, stride)]
 
 
-# Largest error in pixels, of the flow there and back again and of the triangulated point; least angle of its two rays
-# in degrees; depths over the median depth of what SfM found in the photo.
-MOST_ERROR, LEAST_PARALLAX, DEPTHS = 0.7, 1.0, (0.1, 20.0)
+# Largest error in pixels, of the flow there and back again and of the triangulated point.
+MAX_ERROR = 0.7
+# Least angle of the two rays in degrees.
+MIN_PARALLAX = 1.0
+# Least and largest depth of a point over the median depth of what SfM found in the photo.
+DEPTHS = (0.1, 20.0)
 
 
 def _followed(a: _Photo, b: _Photo, there: Float32s, back: Float32s, stride: int) -> _Points:
     """The pixels of ``a``, every ``stride``-th, that the flow leads to ``b`` and back again, triangulated."""
     height, width = a.grey.shape
-    places = np.mgrid[:height, :width][::-1].astype(np.float32)
-    ends = places.transpose(1, 2, 0) + there[:height, :width]
-    returned = there[:height, :width] + cv2.remap(back, ends, None, cv2.INTER_LINEAR)
+    flow = there[:height, :width]
+    starts = np.moveaxis(np.mgrid[:height, :width][::-1], 0, 2).astype(np.float32)
+    ends = starts + flow
+    returned = flow + cv2.remap(back, ends, None, cv2.INTER_LINEAR)
     inside = (ends > 1) & (ends < np.array(b.grey.shape[::-1]) - 2)
-    good = (np.linalg.norm(returned, axis=2) < MOST_ERROR) & inside.all(2)
-    for photo, at in ((a, places), (b, ends.transpose(2, 0, 1))):
-        if photo.counts is not None:
-            good &= cv2.remap(photo.counts.view(np.uint8), at[0], at[1], cv2.INTER_NEAREST) > 0
-    rows, columns = (stride * x for x in np.nonzero(good[::stride, ::stride]))
-    start, end = (np.asarray(x, np.float64) + 0.5 for x in (places[:, rows, columns].T, ends[rows, columns]))
+    good = (np.linalg.norm(returned, axis=2) < MAX_ERROR) & inside.all(2)
+    if a.counts is not None:
+        good &= a.counts
+    if b.counts is not None:
+        good &= cv2.remap(b.counts.view(np.uint8), ends, None, cv2.INTER_NEAREST) > 0
+    rows, columns = (stride * found for found in np.nonzero(good[::stride, ::stride]))
+    start = starts[rows, columns].astype(np.float64) + 0.5
+    end = ends[rows, columns].astype(np.float64) + 0.5
     u, v = a.rays(start), b.rays(end)
-    apart = (u * v).sum(1) < np.cos(np.radians(LEAST_PARALLAX))
-    rows, columns, start, end, u, v = (x[apart] for x in (rows, columns, start, end, u, v))
+    apart = (u * v).sum(1) < np.cos(np.radians(MIN_PARALLAX))
+    rows, columns, start, end, u, v = (each[apart] for each in (rows, columns, start, end, u, v))
     # The point nearest to both rays.
-    between, cosine = b.position - a.position, (u * v).sum(1)
+    cosine = (u * v).sum(1)
+    between = b.position - a.position
     along_u, along_v = u @ between, v @ between
-    s, t = np.stack([along_u - cosine * along_v, cosine * along_u - along_v]) / (1 - cosine**2)
+    s = (along_u - cosine * along_v) / (1 - cosine**2)
+    t = (cosine * along_u - along_v) / (1 - cosine**2)
     points = 0.5 * (a.position + s[:, None] * u + b.position + t[:, None] * v)
-    (pixel_a, depth_a), (pixel_b, depth_b) = a.project(points), b.project(points)
-    error = np.maximum(np.linalg.norm(pixel_a - start, axis=1), np.linalg.norm(pixel_b - end, axis=1))
-    nearest, farthest = (share * a.depth for share in DEPTHS)
-    kept = (error < MOST_ERROR) & (depth_a > nearest) & (depth_b > nearest) & (depth_a < farthest)
-    return points[kept], a.image[rows[kept], columns[kept]], a.detail[rows[kept], columns[kept]]
+    pixels_a, depths_a = a.project(points)
+    pixels_b, depths_b = b.project(points)
+    least, largest = (share * a.depth for share in DEPTHS)
+    kept = (depths_a > least) & (depths_b > least) & (depths_a < largest)
+    for pixels, expected in ((pixels_a, start), (pixels_b, end)):
+        kept &= np.linalg.norm(pixels - expected, axis=1) < MAX_ERROR
+    rows, columns = rows[kept], columns[kept]
+    return points[kept], a.image[rows, columns], a.detail[rows, columns]

@@ -1,7 +1,6 @@
-"""Photos: decoded to RGB bytes and which of them count, undistorted, and kept while a byte budget lasts."""
+"""From the file of a photo to the picture that a view is compared with, which is kept while a byte budget lasts."""
 
 import io
-import logging
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,16 +16,10 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 from torch import Tensor
 
-from nsvq_lightning.data import PANORAMA
-from nsvq_lightning.data.colmap import SceneError, import_pycolmap
+from nsvq_lightning.data.colmap import Pinhole, SceneError
 from nsvq_lightning.data.edges import Edges, edges_of
-from nsvq_lightning.data.pinhole import Pinhole
-from nsvq_lightning.splats.conventions import Bools, Float32s, Uint8s
-
-
-def _undecodable(path: Path, reason: str) -> SceneError:
-    return SceneError(f"image {path} cannot be decoded ({reason}): copy it again, or remove it and run COLMAP again")
-
+from nsvq_lightning.data.undistortion import Undistortion
+from nsvq_lightning.splats.conventions import Bools, Uint8s
 
 # Pillow refuses twice as many, and by default fewer than phones have.
 PIL.Image.MAX_IMAGE_PIXELS = 1 << 27
@@ -66,6 +59,10 @@ def image_head(path: Path) -> ImageHead:
     return ImageHead((width, height), orientation, has_alpha)
 
 
+def _undecodable(path: Path, reason: str) -> SceneError:
+    return SceneError(f"image {path} cannot be decoded ({reason}): copy it again, or remove it and run COLMAP again")
+
+
 def read_image(path: Path) -> Uint8s:
     """Decode an image to RGB ``[H, W, 3]`` uint8: grey is repeated, alpha dropped, 16 bit scaled to 8.
 
@@ -73,7 +70,8 @@ def read_image(path: Path) -> Uint8s:
         SceneError: The file is damaged or has floating-point pixels.
     """
     pixels = _to_bytes(_decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))
-    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
+    image: Uint8s = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+    return image
 
 
 def _decoded(path: Path, flags: int) -> NDArray[Any]:
@@ -111,9 +109,9 @@ def _decoded(path: Path, flags: int) -> NDArray[Any]:
 
 def _to_bytes(pixels: NDArray[Any]) -> Uint8s:
     """Pixels of 8 or 16 bits in 8."""
-    if pixels.dtype == np.uint8:
-        return pixels
-    return np.asarray(cv2.convertScaleAbs(pixels, alpha=1 / 257), np.uint8)  # rounds; none of the 65536 is near a half
+    if pixels.dtype != np.uint8:
+        pixels = cv2.convertScaleAbs(pixels, alpha=1 / 257)  # rounds; none of the 65536 is near a half
+    return pixels
 
 
 def _check_whole(data: bytes) -> None:
@@ -164,23 +162,30 @@ def read_mask(path: Path, width: int, height: int) -> Bools:
     """
     pixels = _decoded(path, cv2.IMREAD_UNCHANGED)
     pixels = pixels.reshape(*pixels.shape[:2], -1)
-    levels, black = pixels[..., :3].max(2), 1 / 2
+    colours = pixels[..., :3]
+    levels = colours.max(2)
+    black = 1 / 2
     if pixels.shape[2] == 4 and np.ptp(pixels[..., 3]) > 0:
         levels = pixels[..., 3]
-    elif np.ptp(pixels[..., :3], axis=2).max() > levels.max() / 16:
+    elif np.ptp(colours, axis=2).max() > levels.max() / 16:
         black = 1 / 32  # also after JPEG
-    kept = (levels > black * int(levels.max())).astype(np.uint8)
-    if not same_shape(kept.shape[1::-1], (width, height)):
+    bright = levels > black * int(levels.max())
+    if not same_shape(bright.shape[::-1], (width, height)):
         raise SceneError(
-            f"mask {path} is of {kept.shape[1]}x{kept.shape[0]}, its photo of {width}x{height}, another shape: "
+            f"mask {path} is of {bright.shape[1]}x{bright.shape[0]}, its photo of {width}x{height}, another shape: "
             "make it from that photo, or remove it"
         )
-    return np.asarray(cv2.resize(kept, (width, height), interpolation=cv2.INTER_NEAREST), bool)
+    kept = cv2.resize(bright.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(kept, bool)
 
 
-def resized_mask(kept: Bools, size: tuple[int, int]) -> Bools:
-    """Which pixels count of a picture made ``size`` (width, height): those all of whose sources do."""
-    return np.asarray(cv2.resize(kept.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255, bool)
+def resized(image: Uint8s, kept: Bools | None, size: tuple[int, int]) -> tuple[Uint8s, Bools | None]:
+    """A picture made ``size`` (width, height), and which of its pixels count: those all of whose sources do."""
+    if image.shape[1::-1] == size:
+        return image, kept
+    if kept is not None:
+        kept = cv2.resize(kept.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA), kept
 
 
 class Picture(NamedTuple):
@@ -220,7 +225,7 @@ class ImageSource:
 
     path: Path
     size: tuple[int, int]
-    undistortion: "Undistortion | None"
+    undistortion: Undistortion | None
     pinhole: Pinhole
     orientation: int = 1
     mask: Path | None = None
@@ -248,11 +253,7 @@ class ImageSource:
             kept = mask if kept is None else kept & mask
         if self.undistortion is not None:
             image, kept = self.undistortion(image, kept)
-        size = self.pinhole.width, self.pinhole.height
-        if image.shape[1::-1] != size:
-            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-            if kept is not None:
-                kept = resized_mask(kept, size)
+        image, kept = resized(image, kept, (self.pinhole.width, self.pinhole.height))
         if kept is None or kept.all():
             return Picture(torch.from_numpy(np.ascontiguousarray(image)), None)
         if not kept.any():
@@ -271,7 +272,8 @@ class ImageSource:
         if pixels.ndim != 3 or pixels.shape[2] != 4:
             raise _undecodable(self.path, f"its transparency is not understood, its pixels are {pixels.shape[2:]}")
         pixels = _turned_back(pixels, undo)
-        image, alpha = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB), np.uint8), pixels[..., 3]
+        image: Uint8s = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB)
+        alpha = pixels[..., 3]
         if not self.white:
             return image, alpha >= 128  # half opaque
         share = alpha.astype(np.float32) / 255
@@ -328,8 +330,8 @@ class ImageStore:
         Raises:
             SceneError: The file cannot be decoded.
         """
-        if (kept := self._edges.get(index)) is not None:
-            return kept
+        if index in self._edges:
+            return self._edges[index]
         found = edges_of(*self[index])
         if found.values.nbytes <= self._free_for_edges:
             self._edges[index] = found
@@ -348,122 +350,3 @@ class ImageStore:
 
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_coming": {}}
-
-
-log = logging.getLogger(__name__)
-
-
-# Source column and row of each pixel, ``[H, W]``, in OpenCV's pixels (centres at integers), and which pixels the camera
-# never saw.
-Maps = tuple[Float32s, Float32s, Bools]
-
-
-class Undistortion:
-    """Mapping from the images of a distorted camera to those of a pinhole camera, cropped so that no pixel is blank.
-
-    The pinhole camera is the one of COLMAP's ``image_undistorter`` with its default options. Distortion is evaluated in
-    the model's pixels, so the image file may have another size than the model says, even another aspect ratio.
-
-    Args:
-        camera: Distorted ``pycolmap.Camera``.
-        width: Width of the image files in pixels.
-        height: Height of the image files in pixels.
-        keep_maps: Keep the map, 9 bytes per pixel, for the next image of this camera.
-
-    Raises:
-        SceneError: The camera has no pinhole counterpart, for example a spherical one.
-    """
-
-    def __init__(self, camera: Any, width: int, height: int, keep_maps: bool = True) -> None:
-        pycolmap = import_pycolmap()
-        try:
-            ideal = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
-        except (ValueError, RuntimeError) as error:
-            remedy = PANORAMA if camera.model_name == "EQUIRECTANGULAR" else "undistort the images with COLMAP first"
-            raise SceneError(
-                f"camera {camera.camera_id} with model {camera.model_name} cannot be turned into a pinhole camera "
-                f"({error}): {remedy}"
-            ) from error
-        self._camera = camera
-        self._scale = (width / camera.width, height / camera.height)
-        size = max(1, round(ideal.width * self._scale[0])), max(1, round(ideal.height * self._scale[1]))
-        self.pinhole = Pinhole(ideal.calibration_matrix(), ideal.width, ideal.height).resized(*size)
-        self._size = (width, height)
-        self._keep_maps = keep_maps
-        self._maps: Maps | None = None
-        self._warned = False
-
-    def __call__(self, image: Uint8s, kept: Bools | None = None) -> tuple[Uint8s, Bools | None]:
-        """Undistort an image ``[H, W, 3]`` of the file's size, and say which pixels of the result count.
-
-        Args:
-            image: The image; pixels that the camera never saw become black.
-            kept: Which of its pixels count ``[H, W]``; None if all do.
-
-        Returns:
-            The pinhole image, and its pixels that the camera saw and whose sources count ``[H, W]``; None if all count.
-        """
-        columns, rows, blank = self.maps()
-        # replicate the border, so that the cubic kernel does not mix black into the edge of the crop
-        result: Uint8s = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        count = None
-        if kept is not None:
-            whole = kept.astype(np.uint8) * np.uint8(255)
-            count = cv2.remap(whole, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) == 255
-        if blank.any():
-            result[blank] = 0
-            count = ~blank if count is None else count & ~blank
-        return result, count
-
-    def maps(self) -> Maps:
-        """Where each pixel of the pinhole image comes from."""
-        if self._maps is not None:
-            return self._maps
-        pixels = self._source_pixels()
-        # more than a pixel outside, or NaN where the ray leaves the domain of the camera model
-        blank: Bools = np.any((pixels <= -1) | (pixels >= self._size) | np.isnan(pixels), axis=-1)
-        columns, rows = (np.nan_to_num(pixels[..., i], nan=-1.0) for i in (0, 1))
-        if blank.any() and not self._warned:
-            self._warned = True
-            log.warning(
-                f"camera {self._camera.camera_id} ({self._camera.model_name}): {100 * blank.mean():.1f} % of the "
-                "pinhole image is left out: its field of view is too wide for a pinhole"
-            )
-        if self._keep_maps:
-            self._maps = columns, rows, blank
-        return columns, rows, blank
-
-    def _source_pixels(self) -> Float32s:
-        """Where each pixel of the pinhole image comes from ``[H, W, 2]``."""
-        K, width, height = self.pinhole.K, self.pinhole.width, self.pinhole.height
-        x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
-        y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
-        pixels = np.empty((height, width, 2), np.float32)
-        at_once = 256  # rows: a whole image in float64 would take gigabytes
-        for top in range(0, height, at_once):
-            grid = np.meshgrid(x, y[top : top + at_once])
-            rays = np.stack([*grid, np.ones_like(grid[0])], axis=-1).reshape(-1, 3)
-            block = np.asarray(self._camera.img_from_cam(rays)) * self._scale - 0.5
-            pixels[top : top + at_once] = block.reshape(-1, width, 2)
-        return pixels
-
-
-def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> tuple[Pinhole, Undistortion | None]:
-    """Pinhole camera of the undistorted images, and how to undistort them (None if there is nothing to do).
-
-    Args:
-        camera: ``pycolmap.Camera`` of any model, or a pinhole.
-        width: Width of the image files in pixels; may differ from the model's.
-        height: Height of the image files in pixels.
-        keep_maps: See :class:`Undistortion`.
-
-    Raises:
-        SceneError: The camera cannot be turned into a pinhole camera.
-    """
-    # An all-zero polynomial is a pinhole too, but COLMAP's undistorter would crop its picture by a pixel.
-    # Fisheye models without distortion are none.
-    polynomial = camera.model_name in ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-    if (polynomial and camera.is_undistorted()) or camera.model_name in ("SIMPLE_PINHOLE", "PINHOLE"):
-        return Pinhole(camera.calibration_matrix(), camera.width, camera.height).resized(width, height), None
-    undistortion = Undistortion(camera, width, height, keep_maps)
-    return undistortion.pinhole, undistortion

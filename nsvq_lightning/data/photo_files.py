@@ -12,7 +12,7 @@ from nsvq_lightning.data.reconstruct import PHOTOS
 log = logging.getLogger(__name__)
 
 
-def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool = False) -> list[Path]:
+def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool = False) -> dict[str, Path]:
     """The file of each photo or mask.
 
     A name that is no file is taken for the one that differs least: in capitals or Unicode form, then in its suffix.
@@ -25,7 +25,7 @@ def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool 
         allow_outside: Also read files that are not in the scene folder.
 
     Returns:
-        Paths, of which those of missing files do not exist.
+        Paths by name, of which those of missing files do not exist.
 
     Raises:
         SceneError: Two files fit a name, two names fit a file, or a name leads out of the scene folder.
@@ -33,7 +33,7 @@ def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool 
     paths = {name: folder / name for name in names}
     exact = {name for name, path in paths.items() if (allow_outside or not is_outside(name)) and path.is_file()}
     if len(exact) == len(paths):
-        return [paths[name] for name in names]
+        return paths
     taken = {paths[name] for name in exact}
     free = [path for path in _photos_in(folder) if path not in taken]
     files = _Files(folder, free, whole=bool(exact))
@@ -57,7 +57,7 @@ def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool 
             del used[path]
     for path, name in list(used.items())[:1]:
         log.info("%d of %d files have other names than in %s: %s is %s", len(used), len(paths), source, name, path)
-    return [paths[name] for name in names]
+    return paths
 
 
 class _Files:

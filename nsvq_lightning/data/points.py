@@ -1,14 +1,18 @@
-"""Point clouds to start from: ``.ply`` files of any program, with colours of any kind."""
+"""Points to start from: those of ``.ply`` files of any program, with colours of any kind, or random ones."""
 
 import re
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from nsvq_lightning.data.colmap import SceneError, rgb_bytes
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.ply import PlyHeader, read_ply_columns, read_ply_header
-from nsvq_lightning.splats.conventions import SH_C0, Float64s, Uint8s
+from nsvq_lightning.random import generator
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.poses import looked_at, poses
+from nsvq_lightning.splats.conventions import SH_C0, Float64s, Int64s, Uint8s
 
 
 def read_points(path: Path) -> tuple[Float64s, Uint8s]:
@@ -66,3 +70,57 @@ def cloud_in(folders: list[Path]) -> Path | None:
         if usual:
             return usual[0]
     return None
+
+
+def share_seen(points: Float64s, cameras: list[Camera]) -> float:
+    """Mean share of the cameras that have a point in their picture, walls disregarded."""
+    return float(_sightings(points, cameras).mean() / len(cameras)) if len(points) else 0.0
+
+
+# Points of a scene that comes without.
+RANDOM_POINTS = 20_000
+
+
+def random_points(cameras: list[Camera]) -> Float64s:
+    """:data:`RANDOM_POINTS` points ``[P, 3]`` in the volume that the cameras see together, always the same ones.
+
+    Candidates are spread over the views, up to twice as far away as what the cameras look at, which is where their
+    optical axes come closest to each other; those that most cameras see are kept.
+
+    Args:
+        cameras: At least one.
+    """
+    draws = generator(0, 0, "random points")
+    count = 8 * RANDOM_POINTS
+    centres, rotations = poses(cameras)
+    # The cameras look at where their axes meet, or as far away as their own extent if that is farther.
+    typical = np.median(np.linalg.norm(centres - looked_at(cameras), axis=1))
+    distance = max(typical, np.linalg.norm(centres - centres.mean(0), axis=1).max(), 1e-6)
+    chosen = torch.randint(len(cameras), (count,), generator=draws).numpy()
+    across, down, away = torch.rand(3, count, generator=draws, dtype=torch.float64).numpy()
+    fx, fy, cx, cy = np.array([camera.intrinsics for camera in cameras])[chosen].T
+    width, height = np.array([(camera.width, camera.height) for camera in cameras])[chosen].T
+    rays = np.stack([(across * width - cx) / fx, (down * height - cy) / fy, np.ones(count)], axis=1)
+    local = rays * (2 * distance * away)[:, None]
+    points = centres[chosen] + np.einsum("pij,pj->pi", rotations.as_matrix()[chosen], local)
+    order = np.argsort(-_sightings(points, cameras), kind="stable")
+    return np.asarray(points[order[:RANDOM_POINTS]])
+
+
+def _sightings(points: Float64s, cameras: list[Camera]) -> Int64s:
+    """Number of cameras ``[P]`` that have each point in their picture."""
+    seen = np.zeros(len(points), np.int64)
+    for camera in cameras:
+        column, row, _ = projected(points, camera)
+        seen += (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return seen
+
+
+def projected(points: Float64s, camera: Camera) -> tuple[Float64s, Float64s, Float64s]:
+    """Column and row in a camera's picture, pixels, and depth ``[P]`` of points ``[P, 3]``; NaN of those behind it."""
+    view = camera.viewmat.double().numpy()
+    fx, fy, cx, cy = camera.intrinsics
+    x, y, z = (points @ view[:3, :3].T + view[:3, 3]).T
+    depth = np.where(z > 0, z, np.nan)
+    with np.errstate(invalid="ignore"):
+        return fx * x / depth + cx, fy * y / depth + cy, depth

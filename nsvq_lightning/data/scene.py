@@ -1,7 +1,7 @@
 """A scene: registered views with pinhole cameras, sparse points, the split into train and test, and photos' detail."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,13 +26,14 @@ from nsvq_lightning.data.images import (
     ImageStore,
     Picture,
     image_head,
-    rectify,
     same_shape,
 )
 from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder
-from nsvq_lightning.data.transforms import random_points, read_poses
+from nsvq_lightning.data.points import random_points
+from nsvq_lightning.data.transforms import read_poses
+from nsvq_lightning.data.undistortion import rectify
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.frame import EXTENT, Frame
+from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
 from nsvq_lightning.splats.conventions import Bools, Float64s
 
 log = logging.getLogger(__name__)
@@ -125,8 +126,9 @@ class Scene:
 Factor = Literal[1, 2, 4, 8]
 # Distance of the cameras from the origin, in extents, from which files have another: float32 would be too coarse.
 _FARTHEST = 100
-# What is so many times as far from the middle as four fifths of its kind has gone astray.
-_ASTRAY = {"cameras": 10, "points": 100}
+# A camera or a point so many times as far from the middle as four fifths of its kind has gone astray.
+_CAMERA_ASTRAY = 10
+_POINT_ASTRAY = 100
 ONE_PLACE = "are taken from one place: without parallax there is no depth; move while taking photos"
 
 
@@ -183,9 +185,13 @@ def load_scene(
     if model is None and poses.source == "COLMAP" and (larger := larger_models(root)) is not None:
         log.warning("%s: %s", root, larger)
     views = range(len(poses.images))
-    test, split, advice = tuple(views[::test_every]), f"every {test_every}th by name", "register more photos"
+    test = tuple(views[::test_every])
+    split = f"every {test_every}th by name"
+    advice = "register more photos"
     if poses.test is not None:
-        test, split, advice = poses.test, f"as {poses.source} says", "check what it lists"
+        test = poses.test
+        split = f"as {poses.source} says"
+        advice = "check what it lists"
     train = tuple(sorted(set(views) - set(test)))
     if not train or not test:
         raise SceneError(
@@ -194,8 +200,9 @@ def load_scene(
         )
     names = [image.name for image in poses.images]
     folder, divisor = photo_folder(root, poses.images_folder or images_folder, factor, names)
-    files = locate(names, folder, f"the {poses.source} model of {root}", allow_outside)
-    lost = [name for name, path in zip(names, files, strict=True) if not path.is_file()]
+    found = locate(names, folder, f"the {poses.source} model of {root}", allow_outside)
+    files = [found[name] for name in names]
+    lost = [name for name in names if not found[name].is_file()]
     if lost:
         raise SceneError(
             f"{len(lost)} of {len(names)} images of the model are not in {folder}, first {lost[0]}: "
@@ -214,14 +221,13 @@ def load_scene(
         poses = replace(poses, points=points, colors=np.full((len(points), 3), 128, np.uint8))
     centres = np.stack([image.centre for image in poses.images])
     extent = EXTENT * frame.unit if np.ptp(centres, axis=0).any() else 0.0
-    usable = _away_from(centres, poses.points, _AT_CAMERA * extent)
-    usable &= ~_astray(poses.points, "points")
+    usable = _away_from(centres, poses.points, _AT_CAMERA * extent) & ~_astray(poses.points, _POINT_ASTRAY)
     if not usable.all():
         text = "left out %d of %d points: they are at the centre of a camera, or far from all others"
         log.warning(text, len(usable) - usable.sum(), len(usable))
     return Scene(
         root=root,
-        names=tuple(image.name for image in poses.images),
+        names=tuple(names),
         cameras=cameras,
         images=ImageStore(sources, cache_bytes),
         points=torch.from_numpy(poses.points[usable]).float(),
@@ -249,39 +255,51 @@ def _image_sources(
     model: ColmapModel, paths: list[Path], masks: list[Path | None], divisor: int, max_width: int | None
 ) -> list[ImageSource]:
     """One source per view; views with the same camera and file size share their undistortion."""
-    calibrated = {number: (camera.width, camera.height) for number, camera in model.cameras.items()}
-    kinds, orientations, heads = [], [], []
+    heads, kinds, others = [], [], 0
     for image, path in zip(model.images, paths, strict=True):
-        expected = calibrated[image.camera_id]
-        try:
-            head = image_head(path)
-        except SceneError:
-            head = ImageHead(expected, 1, False)  # it is left out once its pixels are missed
+        camera = model.cameras[image.camera_id]
+        head = _head_for(path, (camera.width, camera.height))
         heads.append(head)
-        size, on_its_side = head.size, head.size[::-1]
-        # COLMAP calibrates photos as they are stored, other programs as their EXIF orientation shows them.
-        on_side = not same_shape(size, expected) and same_shape(on_its_side, expected)
-        turned = head.orientation >= ON_ITS_SIDE and on_side
-        kinds.append((image.camera_id, on_its_side if turned else size))
-        orientations.append(head.orientation if turned else 1)
-    if turned_count := sum(orientation != 1 for orientation in orientations):
-        log.info("%d of %d photos are turned by their EXIF orientation, as their cameras are", turned_count, len(kinds))
-    if others := sum(not same_shape(size, calibrated[camera_id]) for camera_id, size in kinds):
-        log.warning("%d of %d photos %s", others, len(kinds), OTHER_SHAPE)
+        kinds.append((image.camera_id, head.size))
+        others += not same_shape(head.size, (camera.width, camera.height))
+    if turned := sum(head.orientation != 1 for head in heads):
+        log.info("%d of %d photos are turned by their EXIF orientation, as their cameras are", turned, len(heads))
+    if others:
+        log.warning("%d of %d photos %s", others, len(heads), OTHER_SHAPE)
     keep_maps = len(set(kinds)) <= _CAMERAS_WITH_KEPT_MAPS
-    rectified = {}
-    for camera_id, size in dict.fromkeys(kinds):
-        full, undistortion = rectify(model.cameras[camera_id], *size, keep_maps=keep_maps)
+    lenses = {}
+    for kind in dict.fromkeys(kinds):
+        number, size = kind
+        full, undistortion = rectify(model.cameras[number], *size, keep_maps=keep_maps)
         scale = 1 / divisor if max_width is None or full.width <= max_width else max_width / full.width
-        pinhole = full.resized(max(1, round(full.width * scale)), max(1, round(full.height * scale)))
-        rectified[camera_id, size] = size, undistortion, pinhole
+        lenses[kind] = undistortion, full.scaled(scale, scale)
     return [
-        ImageSource(path, *rectified[kind], orientation, mask, head.has_alpha, model.synthetic)
-        for path, kind, orientation, mask, head in zip(paths, kinds, orientations, masks, heads, strict=True)
+        ImageSource(path, head.size, *lenses[kind], head.orientation, mask, head.has_alpha, model.synthetic)
+        for path, head, kind, mask in zip(paths, heads, kinds, masks, strict=True)
     ]
 
 
+def _head_for(path: Path, expected: tuple[int, int]) -> ImageHead:
+    """The head of a photo for a camera of some size: with the orientation to apply, and the size that it then has."""
+    try:
+        size, orientation, has_alpha = image_head(path)
+    except SceneError:
+        return ImageHead(expected, 1, False)  # it is left out once its pixels are missed
+    # COLMAP calibrates photos as they are stored, other programs as their EXIF orientation shows them.
+    turned = size[::-1]
+    if orientation >= ON_ITS_SIDE and same_shape(turned, expected) and not same_shape(size, expected):
+        return ImageHead(turned, orientation, has_alpha)
+    return ImageHead(size, 1, has_alpha)
+
+
+S = TypeVar("S")
 T = TypeVar("T")
+
+
+def in_parallel(function: Callable[[S], T], items: Sequence[S], title: str) -> list[T]:
+    """What a function gives for each item, with a thread a core and a bar that disappears."""
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        return list(tqdm(pool.map(function, items), title, len(items), leave=False, disable=None))
 
 
 def each_photo(scene: Scene, say: Callable[[Picture], T]) -> list[T | SceneError]:
@@ -296,8 +314,7 @@ def each_photo(scene: Scene, say: Callable[[Picture], T]) -> list[T | SceneError
         except SceneError as error:
             return error
 
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        return list(tqdm(pool.map(look, range(len(scene))), "photos", len(scene), leave=False, disable=None))
+    return in_parallel(look, range(len(scene)), "photos")
 
 
 def usable(scene: Scene) -> Scene:
@@ -311,7 +328,8 @@ def usable(scene: Scene) -> Scene:
     if not wrong:
         return scene
     first = next(iter(wrong.values()))
-    train, test = (tuple(view for view in part if view not in wrong) for part in (scene.train, scene.test))
+    train = tuple(view for view in scene.train if view not in wrong)
+    test = tuple(view for view in scene.test if view not in wrong)
     if not train or not test:
         raise first
     log.warning("left out %d of %d photos, first: %s", len(wrong), len(scene), first)
@@ -322,7 +340,7 @@ def _framed(model: ColmapModel, root: Path) -> tuple[ColmapModel, Frame]:
     """The frame of a model's cameras, and the model with an origin near them; warns of cameras that went astray."""
     centres = np.stack([image.centre for image in model.images])
     frame = Frame.around(centres)
-    lost = np.flatnonzero(_astray(centres, "cameras"))
+    lost = np.flatnonzero(_astray(centres, _CAMERA_ASTRAY))
     if len(lost):
         first = model.images[lost[0]].name
         log.warning("%d photos are far from all others, first %s: check its pose, or leave it out", len(lost), first)
@@ -336,22 +354,26 @@ def _framed(model: ColmapModel, root: Path) -> tuple[ColmapModel, Frame]:
     return replace(model, images=images, points=model.points - frame.middle), Frame(frame.unit, origin=frame.middle)
 
 
-def _astray(places: Float64s, kind: str) -> Bools:
-    """Which places ``[P, 3]`` are much farther from the middle than the others; none of those that are not finite."""
+def _astray(places: Float64s, times: float) -> Bools:
+    """Which places ``[P, 3]`` are much farther from the middle than the others; none of those that are not finite.
+
+    Args:
+        places: Some of which may not be finite.
+        times: As far as four fifths of them, from where on they are astray.
+    """
     finite = places[np.isfinite(places).all(1)]
-    if not len(finite):
-        return np.zeros(len(places), bool)
-    middle = np.median(finite, axis=0)
-    usual = np.quantile(np.linalg.norm(finite - middle, axis=1), 0.8, method="lower")
+    middle, usual = middle_of(finite) if len(finite) else (np.zeros(3), 0.0)
     with np.errstate(invalid="ignore"):
-        return np.asarray((np.linalg.norm(places - middle, axis=1) > _ASTRAY[kind] * usual) & (usual > 0), np.bool_)
+        distances = np.linalg.norm(places - middle, axis=1)
+    return np.asarray((distances > times * usual) & (usual > 0))
 
 
 def _camera(image: ColmapImage, source: ImageSource, frame: Frame) -> Camera:
-    pinhole = source.pinhole
+    lens = source.pinhole
+    pose = torch.from_numpy(image.viewmat)
     try:
-        K, viewmat = torch.from_numpy(pinhole.K), torch.from_numpy(image.viewmat)
-        return Camera(K, viewmat, pinhole.width, pinhole.height, frame.near).to(dtype=torch.float32)
+        camera = Camera(torch.from_numpy(lens.K), pose, lens.width, lens.height, frame.near)
+        return camera.to(dtype=torch.float32)
     except ValueError as error:
         raise SceneError(f"camera {image.camera_id} of image {source.path}: {error}; run COLMAP again") from error
 

@@ -6,7 +6,7 @@ The file has the cameras; the points to start from are those of a ``.ply`` file,
 import json
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -18,11 +18,9 @@ from nsvq_lightning.data import PANORAMA, colmap
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, check_name
 from nsvq_lightning.data.images import image_head
 from nsvq_lightning.data.photo_files import locate
-from nsvq_lightning.data.points import cloud_in, read_points
-from nsvq_lightning.random import generator
+from nsvq_lightning.data.points import cloud_in, read_points, share_seen
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.poses import looked_at, poses
-from nsvq_lightning.splats.conventions import Float64s, Int64s, Uint8s
+from nsvq_lightning.splats.conventions import Float64s, Uint8s
 
 log = logging.getLogger(__name__)
 
@@ -46,11 +44,7 @@ def read_poses(
     check_name(str(root.resolve()), "--data.root", allow_outside=True)
     files = [root / model] if model is not None and model.endswith(".json") else []
     if model is None and colmap.find_model(root) is None:
-        single, train, *tests = (root / f"transforms{part}.json" for part in ("", "_train", "_test", "_val"))
-        if single.is_file():
-            files = [single]
-        elif train.is_file():
-            files = [train, *[test for test in tests if test.is_file()][:1]]  # the second one has the test views
+        files = _files_in(root)
     if files:
         poses = _read_transforms(root, files, allow_outside)
         return poses if len(poses.points) else _with_colmap_points(poses, root)
@@ -61,6 +55,16 @@ def read_poses(
     log.info("%s has no points in its COLMAP model: those of %s take their place", root, cloud)
     points, colors = read_points(cloud)
     return replace(poses, points=points, colors=colors)
+
+
+def _files_in(root: Path) -> list[Path]:
+    """The transforms file of a folder, or that of the train views and the one of the test views; maybe none."""
+    single, train, test, val = (root / f"transforms{part}.json" for part in ("", "_train", "_test", "_val"))
+    if single.is_file():
+        return [single]
+    if not train.is_file():
+        return []
+    return [path for path in (train, test, val) if path.is_file()][:2]
 
 
 def _with_colmap_points(poses: ColmapModel, root: Path) -> ColmapModel:
@@ -79,6 +83,20 @@ def _with_colmap_points(poses: ColmapModel, root: Path) -> ColmapModel:
         return poses
     log.info("%s names no points: those of %s are used", root / poses.source, root / models[0])
     return replace(poses, points=found.points @ moved[:3, :3].T + moved[:3, 3], colors=found.colors)
+
+
+def _numbers(values: object) -> Float64s:
+    """Values of a file as an array; one without dimensions if they are none."""
+    try:
+        return np.array(values, np.float64)
+    except (ValueError, TypeError):
+        return np.zeros(())
+
+
+# A camera: COLMAP's name of the model, width and height in pixels, parameters.
+_Lens = tuple[str, int, int, tuple[float, ...]]
+# Cameras with distortion or without, of k1 to k3, p1 and p2; what is missing of these is 0.
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +120,7 @@ class _Frame:
             SceneError: It is something else.
         """
         value = self.values.get(key, otherwise)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= colmap.LARGEST:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= colmap.MAX_NUMBER:
             raise self.error(f"has {key} = {value!r}, which is no finite number")
         return float(value)
 
@@ -117,30 +135,29 @@ class _Frame:
         folder = self.file.parent
         return str(self.photo.relative_to(folder) if self.photo.is_relative_to(folder) else self.photo)
 
-    def lens(self) -> tuple[str, int, int, tuple[float, ...]]:
-        """Its camera: COLMAP's name of the model, width, height, parameters.
+    def lens(self) -> _Lens:
+        """Its camera.
 
         Raises:
             SceneError: A value is missing or out of range, or the camera's model is not supported.
         """
         width, height = self._size()
-        fx, fy = self._focal("x", width), self._focal("y", height)
+        fx, fy = self._focals(width, height)
         pinhole = (fx, fy, self.number("cx", width / 2), self.number("cy", height / 2))
-        radial = tuple(self.number(f"k{i}") for i in range(1, 5))
-        tangential = self.number("p1"), self.number("p2")
-        fisheye, perspective = "OPENCV_FISHEYE", ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-        model = self.values.get("camera_model", fisheye if self.values.get("is_fisheye") is True else "OPENCV")
-        if model == fisheye and not any(tangential):
-            return fisheye, width, height, (*pinhole, *radial)
-        if model not in perspective or radial[3]:
-            distorted = f" and k4 = {radial[3]:g}" if model in perspective else ""
+        k1, k2, k3, k4, p1, p2 = (self.number(name) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
+        usual = "OPENCV_FISHEYE" if self.values.get("is_fisheye") is True else "OPENCV"
+        model = self.values.get("camera_model", usual)
+        if model == "OPENCV_FISHEYE" and not (p1 or p2):
+            return model, width, height, (*pinhole, k1, k2, k3, k4)
+        if model not in _PERSPECTIVE or k4:
+            distorted = f" and k4 = {k4:g}" if model in _PERSPECTIVE else ""
             raise self.error(
                 f"has camera_model {model}{distorted}, which cannot be read; PINHOLE, OPENCV (k1 to k3, p1, p2) and "
                 "OPENCV_FISHEYE (k1 to k4) can",
                 PANORAMA if model == "EQUIRECTANGULAR" else "export the photos undistorted, as PINHOLE",
             )
-        if any(radial) or any(tangential):
-            return "FULL_OPENCV", width, height, (*pinhole, *radial[:2], *tangential, radial[2], 0.0, 0.0, 0.0)
+        if k1 or k2 or k3 or p1 or p2:
+            return "FULL_OPENCV", width, height, (*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
         return "PINHOLE", width, height, pinhole
 
     def _size(self) -> tuple[int, int]:
@@ -148,26 +165,27 @@ class _Frame:
             if not self.photo.is_file():
                 raise self.error(f"is of the photo {self.photo}, which does not exist", "copy the photo there")
             return image_head(self.photo).size
-        size = round(self.number("w")), round(self.number("h"))
-        if not 0 < min(size) <= max(size) <= colmap.LARGEST_SIDE:
-            raise self.error(f"has size {size[0]}x{size[1]}; sides go from 1 to {colmap.LARGEST_SIDE}")
-        return size
+        width = round(self.number("w"))
+        height = round(self.number("h"))
+        if not 0 < min(width, height) <= max(width, height) <= colmap.MAX_SIDE:
+            raise self.error(f"has size {width}x{height}; sides go from 1 to {colmap.MAX_SIDE}")
+        return width, height
 
-    def _focal(self, axis: str, side: int) -> float:
-        """Focal length in pixels; one that is not given is that of the other axis."""
-        other = "y" if axis == "x" else "x"
-        for name in (axis, other):
-            if f"fl_{name}" in self.values:
-                focal = self.number(f"fl_{name}")
-            elif f"camera_angle_{name}" in self.values:
-                along = side if name == axis else self._size()[name == "y"]
-                focal = along / 2 / max(math.tan(self.number(f"camera_angle_{name}") / 2), 1e-12)
-            else:
-                continue
+    def _focals(self, width: int, height: int) -> tuple[float, float]:
+        """Focal lengths along both axes, pixels; one that is not given is that of the other axis."""
+        given = {}
+        for axis, side in (("x", width), ("y", height)):
+            if f"fl_{axis}" in self.values:
+                given[axis] = self.number(f"fl_{axis}")
+            elif f"camera_angle_{axis}" in self.values:
+                given[axis] = side / 2 / max(math.tan(self.number(f"camera_angle_{axis}") / 2), 1e-12)
+        for focal in given.values():
             if not focal > 0:
                 raise self.error(f"has the focal length {focal:g}")
-            return focal
-        raise self.error("has no focal length: neither fl_x nor camera_angle_x")
+        if not given:
+            raise self.error("has no focal length: neither fl_x nor camera_angle_x")
+        fx = given.get("x") or given["y"]
+        return fx, given.get("y", fx)
 
     def viewmat(self) -> Float64s:
         """World to camera ``[4, 4]``, x right, y down, z forward; the file has the inverse, y up, z backward.
@@ -175,11 +193,8 @@ class _Frame:
         Raises:
             SceneError: It is no rigid motion.
         """
-        try:
-            matrix = np.array(self.values.get("transform_matrix"), np.float64)
-        except (ValueError, TypeError):
-            matrix = np.zeros(0)
-        if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) <= colmap.LARGEST).all():
+        matrix = _numbers(self.values.get("transform_matrix"))
+        if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) <= colmap.MAX_NUMBER).all():
             raise self.error("has no transform_matrix of 4 by 4 finite numbers")
         if not np.allclose(matrix[3:], (0, 0, 0, 1), atol=1e-6):
             raise self.error("has a transform_matrix whose last row is not 0 0 0 1; is it transposed?")
@@ -196,31 +211,39 @@ class _Frame:
 
 
 def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> ColmapModel:
-    heads, frames = zip(*[_frames(file, allow_outside) for file in files], strict=True)
-    chosen = {name: frame for part in frames for name, frame in part.items()}
-    train, test = map(set, frames) if len(files) == 2 else _listed(heads[0], frames[0])
+    """What one file lists, or two: the train and the test views.
+
+    Raises:
+        SceneError: A file is damaged, or has cameras or names that cannot be used.
+    """
+    head, frames = _frames(files[0], allow_outside)
+    train, test = _listed(head, frames)
+    for file in files[1:]:
+        _, tests = _frames(file, allow_outside)
+        train, test = set(frames), set(tests)
+        frames |= tests
     if train & test:
         raise SceneError(f"{files[-1]}: {min(train & test)} is a train and a test photo: list it once")
     is_split = bool(train and test)
-    chosen = {name: frame for name, frame in sorted(chosen.items()) if name in train | test or not is_split}
-    lenses = {name: frame.lens() for name, frame in chosen.items()}
-    numbers = {lens: number for number, lens in enumerate(dict.fromkeys(lenses.values()), start=1)}
-    cameras = {number: colmap.lens(number, *lens) for lens, number in numbers.items()}
-    tops = {PurePosixPath(name).parts[0] if "/" in name else "." for name in chosen}
+    names = sorted(train | test if is_split else frames)
+    tops = {PurePosixPath(name).parts[0] if "/" in name else "." for name in names}
     folder = tops.pop() if len(tops) == 1 else "."
-    images = tuple(
-        ColmapImage(name.removeprefix(f"{folder}/"), numbers[lenses[name]], frame.viewmat(), frame.mask)
-        for name, frame in chosen.items()
-    )
-    points, colors = _points(root, heads[0], images, cameras, allow_outside)
+    numbers: dict[_Lens, int] = {}
+    images = []
+    for name in names:
+        frame = frames[name]
+        number = numbers.setdefault(frame.lens(), len(numbers) + 1)
+        images.append(ColmapImage(name.removeprefix(f"{folder}/"), number, frame.viewmat(), frame.mask))
+    cameras = {number: colmap.lens(number, *lens) for lens, number in numbers.items()}
+    points, colors = _points(root, head, images, cameras, allow_outside)
     return ColmapModel(
-        images=images,
+        images=tuple(images),
         cameras=cameras,
         points=points,
         colors=colors,
         source=files[0].name,
         images_folder=folder,
-        test=tuple(i for i, name in enumerate(chosen) if name in test) if is_split else None,
+        test=tuple(row for row, name in enumerate(names) if name in test) if is_split else None,
         synthetic=files[0].name == "transforms_train.json",
     )
 
@@ -240,7 +263,6 @@ def _frames(file: Path, allow_outside: bool) -> tuple[dict[str, Any], dict[str, 
     if not isinstance(head, dict) or not isinstance(head.get("frames"), list) or not head["frames"]:
         raise SceneError(f"{file} has no list of frames, so it has no cameras: export it again")
     shared = {key: value for key, value in head.items() if key not in ("frames", "file_path", "mask_path")}
-    frames: dict[str, _Frame] = {}
     given = []
     for position, own in enumerate(head["frames"]):
         if not isinstance(own, dict):
@@ -254,24 +276,28 @@ def _frames(file: Path, allow_outside: bool) -> tuple[dict[str, Any], dict[str, 
         locate([path for frame in given if (path := frame.path(key))], file.parent, str(file), allow_outside)
         for key in ("file_path", "mask_path")
     )
-    masks_left = iter(masks)
-    for frame, photo in zip(given, photos, strict=True):
-        frame = replace(frame, photo=photo, mask=next(masks_left) if frame.path("mask_path") else None)
+    frames: dict[str, _Frame] = {}
+    for frame in given:
+        photo = photos[frame.path("file_path") or ""]
+        frame = replace(frame, photo=photo, mask=masks.get(frame.path("mask_path") or ""))
         if frame.name in frames:
             raise frame.error(f"is of {frame.name}, which an earlier frame is of, too", "remove one of them")
         frames[frame.name] = frame
     return head, frames
 
 
-def _listed(head: Mapping[str, Any], frames: Mapping[str, _Frame]) -> list[set[str]]:
+def _listed(head: Mapping[str, Any], frames: Mapping[str, _Frame]) -> tuple[set[str], set[str]]:
     """Names of the train and test photos that a file lists; an empty set where it lists none of them."""
     names = {str(PurePosixPath(name).with_suffix("")): name for name in frames}
-    names |= {str(frame.path("file_path")): name for name, frame in frames.items()} | {name: name for name in frames}
-    lists = [head.get(f"{part}_filenames") for part in ("train", "test", "val")]
-    train, test, val = (
-        {names.get(_plain(str(name)), "") for name in each} if isinstance(each, list) else set() for each in lists
-    )
-    return [train - {""}, (test or val) - {""}]
+    names |= {str(frame.path("file_path")): name for name, frame in frames.items()}
+    names |= {name: name for name in frames}
+
+    def listed(part: str) -> set[str]:
+        """Those of a list, and an empty name for all others in it."""
+        given = head.get(f"{part}_filenames")
+        return {names.get(_plain(str(name)), "") for name in given} if isinstance(given, list) else set()
+
+    return listed("train") - {""}, (listed("test") or listed("val")) - {""}
 
 
 def _plain(path: str) -> str:
@@ -279,7 +305,7 @@ def _plain(path: str) -> str:
 
 
 def _points(
-    root: Path, head: dict[str, Any], images: tuple[ColmapImage, ...], cameras: dict[int, Any], allow_outside: bool
+    root: Path, head: Mapping[str, Any], images: Sequence[ColmapImage], cameras: Mapping[int, Any], allow_outside: bool
 ) -> tuple[Float64s, Uint8s]:
     """The points that a file names, or that lie beside it, in the frame of its cameras; none if there are none.
 
@@ -295,70 +321,16 @@ def _points(
     if path is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     points, colors = read_points(path)
-    try:
-        applied = np.array(head.get("applied_transform"), np.float64)[:3]
-    except (ValueError, TypeError, IndexError):
+    applied = _numbers(head.get("applied_transform"))
+    if applied.shape not in ((3, 4), (4, 4)) or not np.isfinite(applied[:3]).all():
         return points, colors
-    if applied.shape != (3, 4) or not np.isfinite(applied).all():
-        return points, colors
-    pinholes = [
-        Camera(torch.from_numpy(lens.calibration_matrix()), torch.from_numpy(image.viewmat), lens.width, lens.height)
-        for image in images
-        for lens in (cameras[image.camera_id],)
-    ]
-    moved = points @ applied[:, :3].T + applied[:, 3]
-    if share_seen(moved, pinholes) > 1.5 * share_seen(points, pinholes):
+    views = []
+    for image in images:
+        lens = cameras[image.camera_id]
+        K = torch.from_numpy(lens.calibration_matrix())
+        views.append(Camera(K, torch.from_numpy(image.viewmat), lens.width, lens.height))
+    moved = points @ applied[:3, :3].T + applied[:3, 3]
+    if share_seen(moved, views) > 1.5 * share_seen(points, views):
         log.info("%s: the points are not in the frame of the cameras: applied_transform moves them there", path)
         return moved, colors
     return points, colors
-
-
-def share_seen(points: Float64s, cameras: list[Camera]) -> float:
-    """Mean share of the cameras that have a point in their picture, walls disregarded."""
-    return float(_sightings(points, cameras).mean() / len(cameras)) if len(points) else 0.0
-
-
-# Points of a scene that comes without.
-RANDOM_POINTS = 20_000
-
-
-def random_points(cameras: list[Camera]) -> Float64s:
-    """:data:`RANDOM_POINTS` points ``[P, 3]`` in the volume that the cameras see together, always the same ones.
-
-    Candidates are spread over the views, up to twice as far away as what the cameras look at, which is where their
-    optical axes come closest to each other; those that most cameras see are kept.
-
-    Args:
-        cameras: At least one.
-    """
-    draws = generator(0, 0, "random points")
-    count = 8 * RANDOM_POINTS
-    centres, turned = poses(cameras)
-    rotations, middle = turned.as_matrix(), centres.mean(0)
-    # The cameras look at where their axes meet, or as far away as their own extent if that is farther.
-    typical = float(np.median(np.linalg.norm(centres - looked_at(cameras), axis=1)))
-    distance = max(typical, float(np.linalg.norm(centres - middle, axis=1).max()), 1e-6)
-    chosen = torch.randint(len(cameras), (count,), generator=draws).numpy()
-    across, down, away = torch.rand(3, count, generator=draws, dtype=torch.float64).numpy()
-    focal = np.array([camera.intrinsics for camera in cameras])[chosen]
-    size = np.array([(camera.width, camera.height) for camera in cameras])[chosen]
-    depth = 2 * distance * away
-    x, y = (across * size[:, 0] - focal[:, 2]) / focal[:, 0], (down * size[:, 1] - focal[:, 3]) / focal[:, 1]
-    rays = np.stack([x, y, np.ones_like(x)], axis=1)
-    points = centres[chosen] + np.einsum("pij,pj->pi", rotations[chosen], rays * depth[:, None])
-    order = np.argsort(-_sightings(points, cameras), kind="stable")
-    return np.asarray(points[order[:RANDOM_POINTS]])
-
-
-def _sightings(points: Float64s, cameras: list[Camera]) -> Int64s:
-    """Number of cameras ``[P]`` that have each point in their picture."""
-    seen = np.zeros(len(points), np.int64)
-    for camera in cameras:
-        view = camera.viewmat.double().numpy()
-        fx, fy, cx, cy = camera.intrinsics
-        x, y, z = (points @ view[:3, :3].T + view[:3, 3]).T
-        front = np.where(z > 0, z, np.nan)
-        with np.errstate(invalid="ignore"):
-            u, v = fx * x / front + cx, fy * y / front + cy
-            seen += (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    return seen

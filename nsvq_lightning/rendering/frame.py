@@ -13,7 +13,7 @@ import torch
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
-from nsvq_lightning.splats.conventions import Float64s
+from nsvq_lightning.splats.conventions import Float32s, Float64s
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
 # Extent of the cameras in a frame.
@@ -89,5 +89,16 @@ _cameras: WeakKeyDictionary[Camera, dict[Frame, Camera]] = WeakKeyDictionary()
 
 def reach_of(distances: Float64s) -> float:
     """The largest of distances ``[V]`` that is at most :data:`REACH` times what four fifths of them do not exceed."""
-    usual = float(np.quantile(distances, 0.8, method="lower"))
+    usual = _usual(distances)
     return float(distances[distances <= REACH * usual].max() if usual > 0 else distances.max())
+
+
+def middle_of(places: Float32s | Float64s) -> tuple[Float64s, float]:
+    """The median ``[3]`` of places ``[P, 3]``, P > 0, and the distance from it that four fifths do not exceed."""
+    middle = np.median(places.astype(np.float64), axis=0)
+    return middle, _usual(np.linalg.norm(places - middle, axis=1))
+
+
+def _usual(distances: Float64s) -> float:
+    """What four fifths of distances ``[V]`` do not exceed; it is one of them."""
+    return float(np.quantile(distances, 0.8, method="lower"))

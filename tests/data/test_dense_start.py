@@ -86,7 +86,7 @@ def test_the_same_bits_on_any_number_of_cores(monkeypatch: pytest.MonkeyPatch) -
     threads = cv2.getNumThreads()
     try:
         cv2.setNumThreads(7)
-        monkeypatch.setattr(dense_start, "usable_cores", lambda: 5)
+        monkeypatch.setattr("nsvq_lightning.data.scene.usable_cores", lambda: 5)
         assert torch.equal(dense_points(scene, 500, seed=0)[0], first)
         assert cv2.getNumThreads() == 7
     finally:

@@ -48,7 +48,8 @@ def test_a_name_is_taken_for_the_nearest_photo(
 ) -> None:
     caplog.set_level("INFO", logger="nsvq_lightning")
     write(tmp_path, *files)
-    assert locate(names, tmp_path, "the model") == [tmp_path / file for file in files[: len(names)]]
+    found = locate(names, tmp_path, "the model")
+    assert [found[name] for name in names] == [tmp_path / file for file in files[: len(names)]]
     assert f"{len(names)} of {len(names)} files have other names than in the model" in caplog.text
 
 
@@ -69,17 +70,17 @@ def test_what_is_not_clear_is_refused(tmp_path: Path, names: list[str], files: l
 
 def test_a_photo_of_another_folder_is_not_taken_for_one_that_is_gone(tmp_path: Path) -> None:
     write(tmp_path, "a/1.jpg", "a/2.jpg")
-    assert not locate(["a/1.jpg", "b/2.jpg"], tmp_path, "the model")[1].exists()
+    assert not locate(["a/1.jpg", "b/2.jpg"], tmp_path, "the model")["b/2.jpg"].exists()
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".JPG"])
 def test_a_depth_map_is_not_taken_for_a_photo_that_is_gone(tmp_path: Path, suffix: str) -> None:
     write(tmp_path, "1.jpg", "1.png", "2.png")
-    first, second = locate([f"1{suffix}", f"2{suffix}"], tmp_path, "the model")
+    first, second = locate([f"1{suffix}", f"2{suffix}"], tmp_path, "the model").values()
     assert first == tmp_path / "1.jpg"
     assert not second.exists()
     write(tmp_path / "scaled", "1.jpg", "2.png")  # here the suffix is that of all that there is
-    assert locate(["1.jpg", "2.jpg"], tmp_path / "scaled", "the model")[1] == tmp_path / "scaled/2.png"
+    assert locate(["1.jpg", "2.jpg"], tmp_path / "scaled", "the model")["2.jpg"] == tmp_path / "scaled/2.png"
 
 
 @pytest.mark.parametrize("place", [".", "input", "colmap/pictures", "sparse/0"])

@@ -1,4 +1,4 @@
-"""Point clouds of other programs."""
+"""Point clouds of other programs, and random points."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from nsvq_lightning.data.colmap import SceneError
-from nsvq_lightning.data.points import read_points
+from nsvq_lightning.data.points import random_points, read_points, share_seen
+from nsvq_lightning.data.scene import load_scene
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -80,3 +81,14 @@ def test_intensity_is_grey(tmp_path: Path) -> None:
     head = ["ply", "format ascii 1.0", "element vertex 2", *properties, "end_header"]
     path.write_text("\n".join([*head, "1 2 3 0.5", "4 5 6 1", ""]))
     assert read_points(path)[1].tolist() == [[128] * 3, [255] * 3]
+
+
+def test_random_points_fill_what_the_cameras_see_together(demo_scene: Path) -> None:
+    cameras = list(load_scene(demo_scene).cameras)
+    points = random_points(cameras)
+    assert share_seen(points, cameras) > 0.9
+    radius = np.linalg.norm(np.stack([camera.position for camera in cameras]), axis=1).mean()
+    assert points.std(0).min() > 0.05 * radius
+    # Parallel axes meet nowhere.
+    ahead = [camera for camera in cameras[:1] for _ in range(3)]
+    assert share_seen(random_points(ahead), ahead) == 1

@@ -15,11 +15,10 @@ import pytest
 import torch
 from transforms_scenes import APPLIED, opengl_matrix, write_blender, write_nerfstudio
 
-from nsvq_lightning.data import transforms
+from nsvq_lightning.data import points
 from nsvq_lightning.data.colmap import SceneError, read_model
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import Scene, load_scene
-from nsvq_lightning.data.transforms import random_points, share_seen
 
 SceneFactory = Callable[..., Path]
 FEW = 500
@@ -27,7 +26,7 @@ FEW = 500
 
 @pytest.fixture(autouse=True)
 def few_random_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transforms, "RANDOM_POINTS", FEW)
+    monkeypatch.setattr(points, "RANDOM_POINTS", FEW)
 
 
 def change(path: Path, frame: dict[str, Any] | None = None, **head: Any) -> None:
@@ -151,17 +150,6 @@ def test_blender_scenes_have_their_own_split_and_random_points(
     (root / "transforms_test.json").unlink()
     (root / "transforms_val.json").unlink()
     assert load_scene(root).split == "every 8th by name"
-
-
-def test_random_points_fill_what_the_cameras_see_together(demo_scene: Path) -> None:
-    cameras = list(load_scene(demo_scene).cameras)
-    points = random_points(cameras)
-    assert share_seen(points, cameras) > 0.9
-    radius = np.linalg.norm(np.stack([camera.position for camera in cameras]), axis=1).mean()
-    assert points.std(0).min() > 0.05 * radius
-    # Parallel axes meet nowhere.
-    ahead = [camera for camera in cameras[:1] for _ in range(3)]
-    assert share_seen(random_points(ahead), ahead) == 1
 
 
 def test_lists_of_train_and_test_photos_are_followed(make_scene: SceneFactory, tmp_path: Path) -> None:

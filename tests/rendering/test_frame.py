@@ -10,7 +10,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.placing import placed
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
-from nsvq_lightning.rendering.frame import EXTENT, Frame, reach_of
+from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of, reach_of
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import Splats
 
@@ -55,6 +55,13 @@ def test_one_lost_camera_is_no_extent(count: int) -> None:
     assert reach_of(np.array([1.0, 1.0, 1.0, 1.0, 1.9])) == 1.9
     assert reach_of(np.array([1.0, 1.0, 1.0, 1.0, 2.1])) == 1.0
     assert reach_of(np.array([0.0, 0.0, 0.0, 0.0, 2.1])) == 2.1
+
+
+def test_the_middle_is_the_median_and_four_fifths_lie_about_it() -> None:
+    places = np.zeros((5, 3), np.float32)
+    places[:, 1] = (7, 8, 6, 9, -50)
+    middle, reach = middle_of(places)
+    assert (middle.tolist(), reach) == ([0, 7, 0], 2)
 
 
 def test_splats_are_the_same_picture_here_and_in_their_files() -> None:

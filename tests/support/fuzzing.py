@@ -347,7 +347,8 @@ def _build_photos(folder: Path) -> list[Path]:
 
 def _read_photo(path: Path) -> object:
     """Load it as the photo of a view."""
-    from nsvq_lightning.data.images import ImageSource, Pinhole, image_head
+    from nsvq_lightning.data.colmap import Pinhole
+    from nsvq_lightning.data.images import ImageSource, image_head
 
     size = image_head(path).size
     return ImageSource(path, size, None, Pinhole(np.eye(3), *size)).load()

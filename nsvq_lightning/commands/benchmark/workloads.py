@@ -9,10 +9,11 @@ from torch import Tensor
 
 from nsvq_lightning.commands.benchmark import SIZES
 from nsvq_lightning.commands.benchmark.timing import Scope
-from nsvq_lightning.compression.viewpoints import look_at, middle_of
+from nsvq_lightning.compression.viewpoints import look_at
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.frame import middle_of
 from nsvq_lightning.splats.conventions import Float64s
 from nsvq_lightning.splats.splats import RawSplats, Splats, detached
 
@@ -88,7 +89,7 @@ def workloads(scope: Scope) -> list[Workload]:
     if scope.photos is None:
         splats = detached(read_scene(scope.scene).decode())
         centre, reach = middle_of(splats.means.numpy())
-        return [_seen_by(_camera(800, 533, centre, 2 * reach), splats, name)]
+        return [_seen_by(_camera(800, 533, centre, 2 * (reach or 1.0)), splats, name)]
     scene = load_scene(scope.photos)
     if scope.init_from is not None:
         splats = detached(read_scene(scope.init_from).decode())

@@ -1,0 +1,130 @@
+"""Photos of a camera with distortion, as a pinhole camera would have taken them."""
+
+import logging
+from typing import Any
+
+import cv2
+import numpy as np
+
+from nsvq_lightning.data import PANORAMA
+from nsvq_lightning.data.colmap import Pinhole, SceneError, import_pycolmap
+from nsvq_lightning.splats.conventions import Bools, Float32s, Uint8s
+
+log = logging.getLogger(__name__)
+
+# Source column and row of each pixel, ``[H, W]``, in OpenCV's pixels (centres at integers), and which pixels the camera
+# never saw.
+Maps = tuple[Float32s, Float32s, Bools]
+
+
+def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> "tuple[Pinhole, Undistortion | None]":
+    """Pinhole camera of the undistorted images, and how to undistort them (None if there is nothing to do).
+
+    Args:
+        camera: ``pycolmap.Camera`` of any model, or a pinhole.
+        width: Width of the image files in pixels; may differ from the model's.
+        height: Height of the image files in pixels.
+        keep_maps: See :class:`Undistortion`.
+
+    Raises:
+        SceneError: The camera cannot be turned into a pinhole camera.
+    """
+    # An all-zero polynomial is a pinhole too, but COLMAP's undistorter would crop its picture by a pixel.
+    # Fisheye models without distortion are none.
+    polynomial = camera.model_name in ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+    if (polynomial and camera.is_undistorted()) or camera.model_name in ("SIMPLE_PINHOLE", "PINHOLE"):
+        pinhole = Pinhole(camera.calibration_matrix(), camera.width, camera.height)
+        return pinhole.scaled(width / camera.width, height / camera.height), None
+    undistortion = Undistortion(camera, width, height, keep_maps)
+    return undistortion.pinhole, undistortion
+
+
+class Undistortion:
+    """Mapping from the images of a distorted camera to those of a pinhole camera, cropped so that no pixel is blank.
+
+    The pinhole camera is the one of COLMAP's ``image_undistorter`` with its default options. Distortion is evaluated in
+    the model's pixels, so the image file may have another size than the model says, even another aspect ratio.
+
+    Args:
+        camera: Distorted ``pycolmap.Camera``.
+        width: Width of the image files in pixels.
+        height: Height of the image files in pixels.
+        keep_maps: Keep the map, 9 bytes per pixel, for the next image of this camera.
+
+    Raises:
+        SceneError: The camera has no pinhole counterpart, for example a spherical one.
+    """
+
+    def __init__(self, camera: Any, width: int, height: int, keep_maps: bool) -> None:
+        pycolmap = import_pycolmap()
+        try:
+            ideal = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+        except (ValueError, RuntimeError) as error:
+            remedy = PANORAMA if camera.model_name == "EQUIRECTANGULAR" else "undistort the images with COLMAP first"
+            raise SceneError(
+                f"camera {camera.camera_id} with model {camera.model_name} cannot be turned into a pinhole camera "
+                f"({error}): {remedy}"
+            ) from error
+        self._camera = camera
+        self._size = (width, height)
+        self._scale = (width / camera.width, height / camera.height)
+        self.pinhole = Pinhole(ideal.calibration_matrix(), ideal.width, ideal.height).scaled(*self._scale)
+        self._keep_maps = keep_maps
+        self._maps: Maps | None = None
+        self._warned = False
+
+    def __call__(self, image: Uint8s, kept: Bools | None = None) -> tuple[Uint8s, Bools | None]:
+        """Undistort an image ``[H, W, 3]`` of the file's size, and say which pixels of the result count.
+
+        Args:
+            image: The image; pixels that the camera never saw become black.
+            kept: Which of its pixels count ``[H, W]``; None if all do.
+
+        Returns:
+            The pinhole image, and its pixels that the camera saw and whose sources count ``[H, W]``; None if all count.
+        """
+        columns, rows, blank = self.maps()
+        # replicate the border, so that the cubic kernel does not mix black into the edge of the crop
+        result: Uint8s = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        count = None
+        if kept is not None:
+            whole = kept.astype(np.uint8) * np.uint8(255)
+            count = cv2.remap(whole, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) == 255
+        if blank.any():
+            result[blank] = 0
+            count = ~blank if count is None else count & ~blank
+        return result, count
+
+    def maps(self) -> Maps:
+        """Where each pixel of the pinhole image comes from."""
+        if self._maps is not None:
+            return self._maps
+        pixels = self._source_pixels()
+        # more than a pixel outside, or NaN where the ray leaves the domain of the camera model
+        blank: Bools = np.any((pixels <= -1) | (pixels >= self._size) | np.isnan(pixels), axis=-1)
+        columns, rows = (np.nan_to_num(pixels[..., i], nan=-1.0) for i in (0, 1))
+        if blank.any() and not self._warned:
+            self._warned = True
+            log.warning(
+                f"camera {self._camera.camera_id} ({self._camera.model_name}): {100 * blank.mean():.1f} % of the "
+                "pinhole image is left out: its field of view is too wide for a pinhole"
+            )
+        maps = columns, rows, blank
+        if self._keep_maps:
+            self._maps = maps
+        return maps
+
+    def _source_pixels(self) -> Float32s:
+        """Where each pixel of the pinhole image comes from ``[H, W, 2]``."""
+        K = self.pinhole.K
+        width, height = self.pinhole.width, self.pinhole.height
+        x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
+        y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
+        pixels = np.empty((height, width, 2), np.float32)
+        at_once = 256  # rows: a whole image in float64 would take gigabytes
+        for top in range(0, height, at_once):
+            grid = np.meshgrid(x, y[top : top + at_once])
+            rays = np.stack([*grid, np.ones_like(grid[0])], axis=-1).reshape(-1, 3)
+            block = np.asarray(self._camera.img_from_cam(rays)) * self._scale - 0.5
+            pixels[top : top + at_once] = block.reshape(-1, width, 2)
+        return pixels
