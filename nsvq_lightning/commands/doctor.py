@@ -329,7 +329,7 @@ def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
 
 def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     """Decode all photos, in parallel: whether that works, how much masks exclude, and which are not in the model."""
-    from nsvq_lightning.data.reconstruct import PHOTOS
+    from nsvq_lightning.data.photo_files import PHOTOS
     from nsvq_lightning.data.scene import each_photo
 
     # Share of the pixels that count, or what is wrong.

@@ -50,6 +50,7 @@ def run(options: argparse.Namespace) -> int:
     from nsvq_lightning.commands.doctor import check_folder, shown
     from nsvq_lightning.data import reconstruct
     from nsvq_lightning.data.colmap import find_model
+    from nsvq_lightning.data.images import image_head
 
     source, scene = options.source, options.scene
     if not source.exists():
@@ -83,9 +84,10 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError("; ".join([few, *remarks]))
     if find_model(source):
         remarks.append(f"{source} has cameras already: nsvq fit --data.root {shlex.quote(str(source))} uses them")
-    say(*remarks, *reconstruct.oddities(images, names))
+    heads = {name: image_head(images / name) for name in names}
+    say(*remarks, *reconstruct.oddities(heads))
     before = {*reconstruct.stamps_in(scene), *reconstruct.stamps_in(scene / "sparse")}
-    verdict = reconstruct.reconstruct(scene, names, report, is_video, options.max_size, options.threads)
+    verdict = reconstruct.reconstruct(scene, heads, report, is_video, options.max_size, options.threads)
     if not in_place:
         for name in before.difference(names):
             (images / name).unlink(missing_ok=True)

@@ -17,6 +17,8 @@ from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.sh import C0
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
+log = logging.getLogger(__name__)
+
 # The rasterizer with its settings.
 Renderer = Callable[[SplatTensors, Camera], Render]
 
@@ -91,12 +93,9 @@ def sensitivity(
     raw = RawSplats(*(tensor.requires_grad_() for tensor in detached(splats)))
     with torch.enable_grad():
         image = render(raw, camera).image
-    gradients = torch.autograd.grad(image, raw, apply_mask(_drawn(signs, image), mask), allow_unused=True)
-    squares = (
-        torch.zeros_like(tensor) if gradient is None else gradient.square_()
-        for tensor, gradient in zip(raw, gradients, strict=True)
-    )
-    return RawSplats(*squares), image.detach()
+    drawn = apply_mask(_drawn(signs, image), mask)
+    gradients = torch.autograd.grad(image, raw, drawn, materialize_grads=True)
+    return RawSplats(*(gradient.square_() for gradient in gradients)), image.detach()
 
 
 def _drawn(signs: torch.Generator, image: Tensor) -> Tensor:
@@ -116,8 +115,10 @@ def by_opacity(opacities: Tensor) -> Tensor:
 
 
 # Other views need what these do not show, and an estimate from few signs is noise: no effect counts as less than this
-# share of a splat's typical one, and what counts is this power of it, the typical one having the rest.
-LEAST_EFFECT, TRUST = 0.1, 0.75
+# share of a splat's typical one, ...
+MIN_EFFECT = 0.1
+# ... and what counts is this power of it, the typical one having the rest.
+TRUST = 0.75
 
 
 def likely_effects(splats: RawSplats, squares: Tensor) -> Tensor:
@@ -131,10 +132,8 @@ def likely_effects(splats: RawSplats, squares: Tensor) -> Tensor:
     # An opaque splat shows more, a large one hardly: where splats are large, photos were taken from far away.
     typical = splats.opacities.sigmoid().square() * (splats.scales.topk(2).values.sum(1) / 3).exp()
     typical *= (effects / typical)[effects > 0].median()
-    return effects.fmax(LEAST_EFFECT * typical) ** TRUST * typical ** (1 - TRUST)
-
-
-log = logging.getLogger(__name__)
+    counted = effects.fmax(MIN_EFFECT * typical)
+    return counted**TRUST * typical ** (1 - TRUST)
 
 
 def floaters(splats: SplatTensors, views: Callable[[], Iterable[View]], render: Renderer) -> Tensor:
@@ -150,6 +149,7 @@ def floaters(splats: SplatTensors, views: Callable[[], Iterable[View]], render: 
     """
     raw = detached(splats)
     left = torch.arange(len(raw.means), device=raw.means.device)
+    mask = torch.ones_like(left, dtype=torch.bool)
     threshold = torch.inf
     for number in range(12):
         rest = RawSplats(*(tensor[left] for tensor in raw))
@@ -165,7 +165,6 @@ def floaters(splats: SplatTensors, views: Callable[[], Iterable[View]], render: 
         left = left[~gone]
         if threshold == least or len(left) == 0:
             break
-    mask = torch.ones(len(raw.means), dtype=torch.bool, device=raw.means.device)
     mask[left] = False
     return mask
 
@@ -195,8 +194,11 @@ def removal_effects(
         Both sums ``[N]``, and Σ e².
     """
     raw = below_cap(splats)
-    scale, opacities = -by_opacity(raw.opacities), raw.opacities.requires_grad_()
-    slope, curvature, error = torch.zeros_like(scale), torch.zeros_like(scale), 0.0
+    scale = -by_opacity(raw.opacities)
+    opacities = raw.opacities.requires_grad_()
+    slope = torch.zeros_like(scale)
+    curvature = torch.zeros_like(scale)
+    error = 0.0
     for view in views:
         with torch.enable_grad():
             image = apply_mask(render(raw, view.camera).image, view.mask)

@@ -25,12 +25,16 @@ class Setting:
     more: int = 0
 
 
-# Steps of spherical harmonics on a basis, and from how many bits a splat they are, without any codebooks.
-STEPS, ON_BASIS = (0.2, 1.6), 125
+# Steps of spherical harmonics on a basis.
+STEPS = (0.2, 1.6)
+# Bits a splat from which on they are on a basis, without any codebooks.
+ON_BASIS = 125
 # Bits of a splat's position and opacity, about.
 PLACE = 22.0
-# Rather than keep fewer splats than this share, a file takes smaller codebooks. It has at least so many splats.
-SHARE, FEWEST_SPLATS = 0.7, 100
+# Rather than keep fewer splats than this share, a file takes smaller codebooks.
+SHARE = 0.7
+# It has at least so many splats, if there are as many.
+MIN_SPLATS = 100
 
 
 def setting_for(size: int, most: int, sh_degree: int) -> Setting:
@@ -48,7 +52,7 @@ def setting_for(size: int, most: int, sh_degree: int) -> Setting:
         room = int((8 * size - fixed) / (PLACE + bits))
         if room >= SHARE * most:
             break
-    if room < min(FEWEST_SPLATS, most):
+    if room < min(MIN_SPLATS, most):
         raise ValueError(f"{size} bytes leave room for {max(room, 0)} of {most} splats beside codebooks: allow more")
     codes, dim = sizes.get("shN", (0, 1))
     spare = max(0.0, 8 * size - fixed - most * (PLACE + bits))

@@ -36,7 +36,8 @@ def look_at(target: Float64s, eye: Float64s, width: int, height: int, angle: flo
     view = view_towards(target, eye, np.array([0.0, -1.0, 0.0]))
     focal = 0.5 * width / math.tan(angle / 2)
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
-    return Camera(intrinsics, view, width, height, NEARNESS * float(np.linalg.norm(target - eye)) or NEAR)
+    near = NEARNESS * float(np.linalg.norm(target - eye))
+    return Camera(intrinsics, view, width, height, near or NEAR)
 
 
 @torch.no_grad()
@@ -76,8 +77,9 @@ class Measure:
 
     def error(self, splats: SplatTensors) -> float:
         """Root mean square difference for channels in [0, 1]."""
-        found = zip(pictures(splats, self.cameras, self._antialiased), self._expected, strict=True)
-        return math.sqrt(float(np.mean([float((a - b).double().square().mean()) for a, b in found])))
+        found = pictures(splats, self.cameras, self._antialiased)
+        differences = (one - other for one, other in zip(found, self._expected, strict=True))
+        return math.sqrt(np.mean([float(difference.double().square().mean()) for difference in differences]))
 
 
 @dataclass(frozen=True)
@@ -155,16 +157,17 @@ def likely_cameras(
     weights = (detail / detail.sum()).cpu().numpy()
     middle = weights @ means
     reach = math.sqrt(weights @ ((means - middle) ** 2).sum(1)) or 1.0
-    draws, candidates = np.random.default_rng(seed), 5 * count
+    candidates = 5 * count
+    draws = np.random.default_rng(seed)
     directions = draws.standard_normal((candidates, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     eyes = middle + reach * draws.uniform(1.5, 3.0, (candidates, 1)) * directions
     targets = middle + reach * 0.6 * draws.standard_normal((candidates, 3))
     across, up, _ = np.abs(eyes - targets).T
     eyes[:, 0] += np.where(across < 0.05 * up, 0.2 * up, 0.0)  # straight up or down, a camera has no upright
-    views = zip(eyes, targets, strict=True)
-    low = 96, round(96 * height / width)
-    scores = [_detail(splats, look_at(target, eye, *low, angle)) for eye, target in views]
+    low = round(96 * height / width)
+    views = zip(targets, eyes, strict=True)
+    scores = [_detail(splats, look_at(target, eye, 96, low, angle)) for target, eye in views]
     best = np.argsort(-np.array(scores), kind="stable")[:count]
     return [look_at(targets[k], eyes[k], width, height, angle) for k in best]
 
@@ -174,5 +177,6 @@ def _detail(splats: SplatTensors, camera: Camera) -> float:
     """Mean difference between neighbouring pixels, times the share of the picture that is covered."""
     view = render(splats, camera)
     image = view.image.clamp(0, 1)
-    across, down = (image[:, 1:] - image[:, :-1]).abs().mean(), (image[1:] - image[:-1]).abs().mean()
+    across = image.diff(dim=1).abs().mean()
+    down = image.diff(dim=0).abs().mean()
     return float((across + down) * view.alpha.mean())

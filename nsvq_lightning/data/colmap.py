@@ -421,8 +421,9 @@ def larger_models(root: Path) -> str | None:
 def _observations(rows: Sequence[tables.ImageRow], tracks: Sequence[Sequence[int]]) -> Int64s:
     """Pairs of point row and image row, each once: a track may have two features in one image."""
     row_of = {image.number: row for row, image in enumerate(rows)}
-    sightings = [(point, image) for point, track in enumerate(tracks) for image in track]
-    pairs = [(point, row_of[image]) for point, image in sightings if image in row_of]
-    if len(pairs) < len(sightings):
-        log.warning("left out %d sightings by images that the model does not have", len(sightings) - len(pairs))
-    return np.unique(np.array(pairs, np.int64).reshape(-1, 2), axis=0)
+    pairs = [(point, row_of.get(image, -1)) for point, track in enumerate(tracks) for image in track]
+    sightings = np.array(pairs, np.int64).reshape(-1, 2)
+    lost = sightings[:, 1] < 0
+    if lost.any():
+        log.warning("left out %d sightings by images that the model does not have", lost.sum())
+    return np.unique(sightings[~lost], axis=0)

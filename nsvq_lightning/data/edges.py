@@ -48,8 +48,9 @@ def high_pass(image: Tensor, depth: int, mask: Tensor | None) -> NDArray[Any]:
         mask: Which pixels count ``[H, W]`` bool; None if all do.
     """
     grey = cv2.cvtColor(image.cpu().numpy(), cv2.COLOR_RGB2GRAY)
-    kernel = np.array([[-1, -1, -1], [-1, 8, -1], [-1, -1, -1]], np.float32)
-    passed = np.asarray(cv2.filter2D(grey, depth, kernel))
+    kernel = np.full((3, 3), -1, np.float32)
+    kernel[1, 1] = 8
+    passed: NDArray[Any] = cv2.filter2D(grey, depth, kernel)
     if mask is not None:
         passed *= cv2.erode(mask.cpu().numpy().view(np.uint8), np.ones((3, 3), np.uint8))
     return passed

@@ -12,6 +12,7 @@ import numpy as np
 import PIL.Image
 import torch
 from numpy.typing import NDArray
+from PIL.ExifTags import Base
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 from torch import Tensor
@@ -25,9 +26,7 @@ from nsvq_lightning.splats.conventions import Bools, Uint8s
 PIL.Image.MAX_IMAGE_PIXELS = 1 << 27
 # What Pillow raises for a file that is damaged, not a picture, or beyond that limit.
 DAMAGED = (OSError, ValueError, SyntaxError, KeyError, PIL.Image.DecompressionBombError)
-# EXIF and TIFF tag: how to turn the stored pixels.
-ORIENTATION = 274
-# Its values from here on: stored lying on its side, so that programs that apply it swap width and height.
+# EXIF orientations from here on: stored lying on its side, so that programs that apply it swap width and height.
 ON_ITS_SIDE = 5
 
 
@@ -50,9 +49,9 @@ def image_head(path: Path) -> ImageHead:
             width, height = image.size
             # Pillow decodes a whole PNG to look for a tag that is hardly ever there.
             tags = {} if image.format == "PNG" else image.getexif()
-            orientation = int(tags.get(ORIENTATION, 1))
+            orientation = int(tags.get(Base.Orientation, 1))
             if image.format == "TIFF":  # Pillow applies the orientation to their size
-                width, height = int(tags[256]), int(tags[257])
+                width, height = int(tags[Base.ImageWidth]), int(tags[Base.ImageLength])
             has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
     except DAMAGED as error:
         raise _undecodable(path, str(error)) from error
@@ -94,7 +93,7 @@ def _decoded(path: Path, flags: int) -> NDArray[Any]:
     try:
         with PIL.Image.open(io.BytesIO(data)) as head:
             # OpenCV applies the orientation to TIFFs even when told not to.
-            applied = int(head.getexif().get(ORIENTATION, 1)) if head.format == "TIFF" else 1
+            applied = int(head.getexif().get(Base.Orientation, 1)) if head.format == "TIFF" else 1
             _check_whole(data)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
@@ -131,9 +130,13 @@ def _check_whole(data: bytes) -> None:
 
 def _turned_back(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
     """Pixels to which an EXIF orientation was applied, as they were stored."""
-    stored = pixels.swapaxes(0, 1) if orientation >= ON_ITS_SIDE else pixels
-    mirrored = {2: (1,), 3: (0, 1), 4: (0,), 6: (0,), 7: (0, 1), 8: (1,)}  # axes
-    return np.ascontiguousarray(np.flip(stored, mirrored.get(orientation, ())))
+    if orientation >= ON_ITS_SIDE:
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (3, 4, 6, 7):
+        pixels = pixels[::-1]
+    if orientation in (2, 3, 7, 8):
+        pixels = pixels[:, ::-1]
+    return np.ascontiguousarray(pixels)
 
 
 # Relative difference of aspect ratios that rounding explains.

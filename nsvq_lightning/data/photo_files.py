@@ -7,9 +7,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 from nsvq_lightning.data.colmap import ColmapImage, SceneError, check_name, is_outside
-from nsvq_lightning.data.reconstruct import PHOTOS
 
 log = logging.getLogger(__name__)
+
+# Suffixes of photos that both COLMAP and this package read.
+PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 
 def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool = False) -> dict[str, Path]:
@@ -40,22 +42,23 @@ def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool 
     used: dict[Path, str] = {}
     for name in sorted(paths.keys() - exact):
         fitting = files.nearest(name)
-        if len(fitting) > 1:
-            raise SceneError(f"{source} names {name}, which may be {fitting[0]} or {fitting[1]}: remove or rename one")
         if not fitting:
             check_name(name, source, allow_outside)
             continue
-        paths[name] = fitting[0]
-        if fitting[0] in used:
-            raise SceneError(f"{source} names {used[fitting[0]]} and {name}, but there is only {fitting[0]}: copy both")
-        used[fitting[0]] = name
+        path, *others = fitting
+        if others:
+            raise SceneError(f"{source} names {name}, which may be {path} or {others[0]}: remove or rename one")
+        if path in used:
+            raise SceneError(f"{source} names {used[path]} and {name}, but there is only {path}: copy both")
+        used[path] = name
     stems = {path.with_suffix("") for path in taken | used.keys()}
-    others = {_kind(path.name) for path in free if path not in used and path.with_suffix("") in stems}
+    kinds = {_kind(path.name) for path in free if path not in used and path.with_suffix("") in stems}
     for path, name in list(used.items()):
-        if _kind(path.name) in others - {_kind(name)}:  # such as depth maps beside all photos, of which one is gone
-            paths[name] = folder / name
+        if _kind(path.name) in kinds - {_kind(name)}:  # such as depth maps beside all photos, of which one is gone
             del used[path]
-    for path, name in list(used.items())[:1]:
+    paths |= {name: path for path, name in used.items()}
+    if used:
+        path, name = next(iter(used.items()))
         log.info("%d of %d files have other names than in %s: %s is %s", len(used), len(paths), source, name, path)
     return paths
 
@@ -82,10 +85,14 @@ class _Files:
 
     def nearest(self, name: str) -> list[Path]:
         """The files that fit a name best, by most of its parts, in the fewest folders, with its suffix."""
-        fitting = next((self._found[key] for key in self._keys(name) if key in self._found), [])
         wanted = _kind(name)
-        closeness = {path: (-len(path.parts), _kind(path.name) == wanted) for path in fitting}
-        return [path for path in fitting if closeness[path] == max(closeness.values())]
+
+        def closeness(path: Path) -> tuple[int, bool]:
+            return -len(path.parts), _kind(path.name) == wanted
+
+        fitting = next((self._found[key] for key in self._keys(name) if key in self._found), [])
+        best = max(map(closeness, fitting), default=None)
+        return [path for path in fitting if closeness(path) == best]
 
 
 def _key(name: str) -> str:
@@ -127,8 +134,8 @@ def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]
     if (root / name).is_dir():
         return root / name, factor or 1
     plain = [given.replace("\\", "/") for given in names]
-    folders = [root, *(path for depth in ("*", "*/*") for path in sorted(root.glob(depth)) if "mask" not in path.name)]
-    found = [path for path in folders if all((path / given).is_file() for given in plain)]
+    folders = [path for depth in ("*", "*/*") for path in sorted(root.glob(depth)) if "mask" not in path.name]
+    found = [path for path in (root, *folders) if all((path / given).is_file() for given in plain)]
     if len(found) != 1:
         others = " and ".join(str(path.relative_to(root)) for path in found)
         raise SceneError(

@@ -12,9 +12,8 @@ import sqlite3
 import threading
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,11 @@ import numpy as np
 import PIL.Image
 import PIL.ImageOps
 from cv2.typing import MatLike
+from PIL.ExifTags import IFD, Base
 
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
-from nsvq_lightning.data.images import DAMAGED, ORIENTATION, image_head, read_image
+from nsvq_lightning.data.images import DAMAGED, ImageHead, read_image
+from nsvq_lightning.data.photo_files import PHOTOS
 from nsvq_lightning.io.atomic import write_bytes, write_text
 
 
@@ -51,10 +52,10 @@ class Verdict:
 
     def told(self, images: Path) -> Iterator[str]:
         """What came out, and what to take again."""
-        count, total = len(self.registered), len(self.registered) + len(self.missing)
+        count = len(self.registered)
         yield (
-            f"{count} of {total} photos have found their place, {self.points:,} points, seen by {self.track:.1f} "
-            f"photos each, error {self.error:.2f} pixels"
+            f"{count} of {count + len(self.missing)} photos have found their place, {self.points:,} points, seen by "
+            f"{self.track:.1f} photos each, error {self.error:.2f} pixels"
         )
         if self.error > 1.5:
             yield "  the error is large: was zoom or focus changing, or something moving?"
@@ -65,30 +66,37 @@ class Verdict:
             yield f"{apart}take more photos between"
         if not self.missing:
             return
-        some = self.registered[:: max(1, count // MIN_PHOTOS)]
-        usual = sorted(sharpness(read_image(images / name)) for name in some)[len(some) // 2]
+        placed = [sharpness(read_image(images / name)) for name in self.registered[:: max(1, count // MIN_PHOTOS)]]
+        usual = sorted(placed)[len(placed) // 2]
         yield "  without a place, better taken again:"
-        listed = 8
-        for name, partners in list(self.missing.items())[:listed]:
+        for name, partners in itertools.islice(self.missing.items(), MAX_NAMED):
+            reason = f"shares enough with {partners} other photos" if partners else "overlaps no other"
             if sharpness(read_image(images / name)) < 0.3 * usual:
                 reason = "blurred"
-            else:
-                reason = f"shares enough with {partners} other photos" if partners else "overlaps no other"
             yield f"    {name}: {reason}"
-        if len(self.missing) > listed:
-            yield f"    and {len(self.missing) - listed} more"
+        if len(self.missing) > MAX_NAMED:
+            yield f"    and {len(self.missing) - MAX_NAMED} more"
 
 
 # Photos below which a scene is likely to look good only from where they were taken.
 MIN_PHOTOS = 20
+# Photos that are named; of the others, their number is.
+MAX_NAMED = 8
 # Files in a scene: what of it was made; features and matches; which photos were used.
-RECORD, DATABASE, STAMPS = "prepare.json", "database.db", "photos.json"
+RECORD = "prepare.json"
+DATABASE = "database.db"
+STAMPS = "photos.json"
 # Called with a step, how much of it is done, and how much there is.
 Report = Callable[[str, int, int], None]
 
 
 def reconstruct(
-    scene: Path, names: Sequence[str], report: Report, is_video: bool = False, max_size: int = 1600, threads: int = -1
+    scene: Path,
+    photos: Mapping[str, ImageHead],
+    report: Report,
+    is_video: bool = False,
+    max_size: int = 1600,
+    threads: int = -1,
 ) -> Verdict:
     """Find the cameras of the photos in ``scene/images`` and write them to ``scene/sparse/0``.
 
@@ -97,7 +105,7 @@ def reconstruct(
 
     Args:
         scene: Folder of the scene.
-        names: Files in ``scene/images``, with ``/`` in those of its subfolders.
+        photos: Heads of the files in ``scene/images`` by name, with ``/`` in those of its subfolders.
         report: Where to say how far it is.
         is_video: Whether they are frames in order.
         max_size: Longer side in pixels to which photos are reduced for finding features.
@@ -106,25 +114,24 @@ def reconstruct(
     Raises:
         SceneError: Too few photos belong together, or a name is not UTF-8, at which COLMAP would crash.
     """
-    for name in (str(scene.resolve()), *names):
+    for name in (str(scene.resolve()), *photos):
         check_name(name, "the scene to prepare", allow_outside=True)
     pycolmap = import_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     pycolmap.set_random_seed(0)
-    database, images = scene / DATABASE, scene / "images"
-    stamps = _extract(database, images, names, report, max_size, threads)
-    _compare(database, len(names), report, is_video, threads)
-    models = _map(database, scene, stamps, report, threads)
-    common = dict(_rows(database, _PARTNERS, json.dumps(names)))
+    stamps = _extract(scene, photos, report, max_size, threads)
+    _compare(scene, len(photos), report, is_video, threads)
+    models = _map(scene, stamps, report, threads)
+    common = dict(_rows(scene, _PARTNERS, json.dumps(list(photos))))
     if not models:
-        why = "; ".join(oddities(images, names)) or _NOTHING_IN_COMMON
+        why = "; ".join(oddities(photos)) or _NOTHING_IN_COMMON
         kept = "; the scene of before is as it was" if (scene / "sparse").is_dir() else ""
-        raise SceneError(f"{scene}: {why}. Photos with a partner: {len(common)} of {len(names)}{kept}")
+        raise SceneError(f"{scene}: {why}. Photos with a partner: {len(common)} of {len(photos)}{kept}")
     model = models[0]
     registered = _registered(model)
     return Verdict(
         tuple(sorted(registered)),
-        {name: common.get(name, 0) for name in names if name not in registered},
+        {name: common.get(name, 0) for name in photos if name not in registered},
         model.num_points3D(),
         model.compute_mean_reprojection_error(),
         model.compute_mean_track_length(),
@@ -138,17 +145,16 @@ _NOTHING_IN_COMMON = (
 )
 
 
-def oddities(images: Path, names: Sequence[str]) -> Iterator[str]:
+def oddities(photos: Mapping[str, ImageHead]) -> Iterator[str]:
     """What is unusual about photos and makes it unlikely that their cameras are found.
 
     Args:
-        images: Folder of the photos.
-        names: Their names in it.
+        photos: Their heads by name.
     """
-    if len(names) <= 3:
-        yield f"{len(names)} photos are hardly enough for a scene: take 50 to 300 from different places"
-    wide = [name for name in names if Fraction(*image_head(images / name).size) == 2]
-    if 2 * len(wide) > len(names):
+    if len(photos) <= 3:
+        yield f"{len(photos)} photos are hardly enough for a scene: take 50 to 300 from different places"
+    wide = [name for name, head in photos.items() if head.size[0] == 2 * head.size[1]]
+    if 2 * len(wide) > len(photos):
         yield (
             f"{some(wide)} are twice as wide as high: 360° panoramas must be cut into ordinary views first, for "
             "example with 'ffmpeg -i panorama.jpg -vf v360=e:flat:yaw=90 view.jpg' for each direction"
@@ -156,38 +162,40 @@ def oddities(images: Path, names: Sequence[str]) -> Iterator[str]:
 
 
 # Photos of one camera from which on it has a lens model of four numbers, not one.
-SHARED = 8
+MIN_SHARED = 8
 
 
 def _extract(
-    database: Path, images: Path, names: Sequence[str], report: Report, max_size: int, threads: int
+    scene: Path, photos: Mapping[str, ImageHead], report: Report, max_size: int, threads: int
 ) -> dict[str, str]:
     """Find features in photos that have none yet; returns the stamp of each photo."""
     pycolmap = import_pycolmap()
+    images = scene / "images"
     groups: defaultdict[Any, list[str]] = defaultdict(list)
-    for name in names:
-        groups[_camera_of(images / name)].append(name)
+    for name, head in photos.items():
+        path = images / name
+        groups[path.parent, head.size, _lens_of(path)].append(name)
     stamps = {}
     for group in groups.values():
-        model = "OPENCV" if len(group) >= SHARED else "SIMPLE_RADIAL"
+        model = "OPENCV" if len(group) >= MIN_SHARED else "SIMPLE_RADIAL"
         for name in group:
             stamps[name] = f"{model} {zlib.crc32((images / name).read_bytes()):08x}"
-    known = stamps_in(images.parent)
-    if not database.exists() or any(known.get(name, stamp) != stamp for name, stamp in stamps.items()):
-        remove_database(images.parent)
+    known = stamps_in(scene)
+    if not (scene / DATABASE).exists() or any(known.get(name, stamp) != stamp for name, stamp in stamps.items()):
+        remove_database(scene)
         known = {}
     # With those of photos that have gone, whose features stay in the database; they may come back.
-    write_text(images.parent / STAMPS, json.dumps(known | stamps))
+    write_text(scene / STAMPS, json.dumps(known | stamps))
     options = pycolmap.FeatureExtractionOptions(max_image_size=max_size, num_threads=threads, use_gpu=False)
     done = 0
     for group in groups.values():
         reader = pycolmap.ImageReaderOptions(camera_model=stamps[group[0]].split()[0])
         # The first one alone makes the camera of its group. COLMAP passes over photos that have features already.
         for batch in (group[:1], *(group[start : start + 4] for start in range(1, len(group), 4))):
-            cameras = dict(_rows(database, "select name, camera_id from images"))
+            cameras = dict(_rows(scene, "select name, camera_id from images"))
             reader.existing_camera_id = next((cameras[name] for name in group if name in cameras), -1)
             pycolmap.extract_features(
-                database,
+                scene / DATABASE,
                 images,
                 batch,
                 camera_mode=pycolmap.CameraMode.SINGLE,
@@ -196,24 +204,19 @@ def _extract(
                 device=pycolmap.Device.cpu,
             )
             done += len(batch)
-            report("finding features", done, len(names))
+            report("finding features", done, len(photos))
     return stamps
 
 
-# EXIF tags: model of a camera; the part on how a photo was taken; in that, focal length, and what it would be on film.
-MODEL, HOW, FOCAL, FOCAL_ON_FILM = 272, 34665, 37386, 41989
-
-
-def _camera_of(path: Path) -> tuple[object, ...]:
-    """What photos of one camera have in common: folder, size, and what EXIF says of camera and lens."""
+def _lens_of(path: Path) -> str:
+    """What EXIF says of the camera and the lens of a photo."""
     with PIL.Image.open(path) as image:
         # Pillow decodes a whole PNG to look for it elsewhere.
         tags = PIL.Image.Exif()
         tags.load(image.info.get("exif", b""))
-    how = tags.get_ifd(HOW)
-    lens = [tags.get(MODEL), how.get(FOCAL), how.get(FOCAL_ON_FILM)]
+    how = tags.get_ifd(IFD.Exif)
     # As text: the number 0/0, which some write, is not equal to itself.
-    return path.parent, image_head(path).size, str(lens)
+    return str([tags.get(Base.Model), how.get(Base.FocalLength), how.get(Base.FocalLengthIn35mmFilm)])
 
 
 def stamps_in(folder: Path) -> dict[str, str]:
@@ -229,44 +232,45 @@ def remove_database(scene: Path) -> None:
 
 
 # Photos up to which every pair is compared; frames of a video are compared with those near them from half of it on.
-EXHAUSTIVE = 120
+MAX_EXHAUSTIVE = 120
 # Frames after each with which it is compared, and as many farther ones at distances that double.
 OVERLAP = 12
 
 
-def _compare(database: Path, count: int, report: Report, is_video: bool, threads: int) -> None:
+def _compare(scene: Path, count: int, report: Report, is_video: bool, threads: int) -> None:
     """Compare photos, and say now and then how many pairs are done."""
     pycolmap = import_pycolmap()
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
     how = {"matching_options": matching, "device": pycolmap.Device.cpu}
-    exhaustive = count <= (EXHAUSTIVE // 2 if is_video else EXHAUSTIVE)
+    exhaustive = count * (1 + is_video) <= MAX_EXHAUSTIVE
     pairs = count * (count - 1) // 2 if exhaustive else 2 * OVERLAP * count
     ended = threading.Event()
 
     def poll() -> None:
         while not ended.wait(timeout=1.0):
             with contextlib.suppress(sqlite3.Error):
-                done = _rows(database, "select count(*) from two_view_geometries")[0][0]
+                done = _rows(scene, "select count(*) from two_view_geometries")[0][0]
                 report("comparing photos", min(done, pairs), pairs)
 
     polling = threading.Thread(target=poll, daemon=True)
     polling.start()
     try:
         if exhaustive:
-            pycolmap.match_exhaustive(database, **how)
+            pycolmap.match_exhaustive(scene / DATABASE, **how)
         else:
             pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
-            pycolmap.match_sequential(database, pairing_options=pairing, **how)
+            pycolmap.match_sequential(scene / DATABASE, pairing_options=pairing, **how)
     finally:
         ended.set()
         polling.join()
     report("comparing photos", pairs, pairs)
 
 
-def _map(database: Path, scene: Path, stamps: dict[str, str], report: Report, threads: int) -> list[Any]:
+def _map(scene: Path, stamps: dict[str, str], report: Report, threads: int) -> list[Any]:
     """The models, the largest first, which are then in ``scene/sparse``; one of other photos there is replaced."""
     pycolmap = import_pycolmap()
-    work, sparse = scene / "mapping", scene / "sparse"
+    work = scene / "mapping"
+    sparse = scene / "sparse"
     if stamps_in(sparse) != stamps:
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir()
@@ -275,7 +279,7 @@ def _map(database: Path, scene: Path, stamps: dict[str, str], report: Report, th
         options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=0, min_model_size=3)
         options.image_names = list(stamps)
         found = pycolmap.incremental_mapping(
-            database,
+            scene / DATABASE,
             scene / "images",
             work,
             options=options,
@@ -321,17 +325,16 @@ _PARTNERS = """
 """
 
 
-def _rows(database: Path, query: str, *parameters: str) -> list[tuple[Any, ...]]:
-    """What a query finds in a database; nothing where there is none."""
+def _rows(scene: Path, query: str, *parameters: str) -> list[tuple[Any, ...]]:
+    """What a query finds in the database of a scene; nothing where there is none."""
+    database = scene / DATABASE
     if not database.exists():
         return []
     with contextlib.closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=rw", uri=True)) as connection:
         return connection.execute(query, parameters).fetchall()
 
 
-# Suffixes of photos that both COLMAP and this package read.
-PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-# Suffixes of those that are converted if Pillow reads them, and of raw files.
+# Suffixes of photos that are converted if Pillow reads them, and of raw files.
 CONVERTED = (".jfif", ".jpe", ".avif", ".heic", ".heif", ".hif", ".jxl", ".jp2", ".gif")
 RAW = (".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 # Suffixes of videos.
@@ -414,7 +417,7 @@ def _copy(path: Path, target: Path) -> Path:
     with PIL.Image.open(path) as image:
         if image.format == "TIFF" and path.suffix.lower() not in PHOTOS:
             raise ValueError("the preview in a raw file")
-        is_plain = image.getexif().get(ORIENTATION, 1) == 1 and image.mode[0] not in "IF"
+        is_plain = image.getexif().get(Base.Orientation, 1) == 1 and image.mode[0] not in "IF"
         as_is = image.format in COLMAP_READS and (in_place or is_plain)
         is_lossless = image.format in LOSSLESS or image.has_transparency_data
         kind, suffixes = ("PNG", (".png",)) if is_lossless else ("JPEG", (".jpg", ".jpeg"))
@@ -446,8 +449,8 @@ def _converted(image: PIL.Image.Image, path: Path, kind: str) -> bytes:
 
 def some(names: Sequence[str]) -> str:
     """The first of many names, and how many more there are."""
-    shown = ", ".join(names[:8])
-    return f"{shown} and {len(names) - 8} more" if len(names) > 8 else shown
+    shown = ", ".join(names[:MAX_NAMED])
+    return f"{shown} and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else shown
 
 
 def sharpness(picture: MatLike) -> float:
@@ -481,11 +484,8 @@ def write_frames(video: Path, folder: Path, count: int, report: Report) -> list[
     parts = min(count, total)
     names: list[str] = []
     last: MatLike | None = None
-
-    def show(done: int) -> None:
-        report("choosing frames", done, total)
-
-    for _, part in itertools.groupby(_frames(video, show), key=lambda frame: frame[0] * parts // total):
+    frames = _frames(video, lambda done: report("choosing frames", done, total))
+    for _, part in itertools.groupby(frames, key=lambda frame: frame[0] * parts // total):
         number, picture = max(part, key=lambda frame: sharpness(frame[1]))
         tiny = cv2.resize(picture, (48, 27), interpolation=cv2.INTER_AREA).astype(np.float32)
         if last is not None and float(np.abs(tiny - last).mean()) < STILL:

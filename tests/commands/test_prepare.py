@@ -112,7 +112,7 @@ def test_photos_are_added_and_leave_by_the_same_command(
         (scene / "photos.json").write_text(json.dumps(dict.fromkeys(names, "")))
         if "odd.png" in names:
             raise ValueError("no place")
-        found.append(names)
+        found.append(list(names))
         (scene / "sparse").mkdir(exist_ok=True)
         shutil.copy(scene / "photos.json", scene / "sparse")
         return reconstruct.Verdict(tuple(names), {}, 1, 0.1, 2.0, 1)

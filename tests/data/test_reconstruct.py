@@ -10,7 +10,7 @@ import pytest
 
 from nsvq_lightning.data import reconstruct
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap
-from nsvq_lightning.data.images import image_head, read_image
+from nsvq_lightning.data.images import ImageHead, image_head, read_image
 from nsvq_lightning.data.reconstruct import copy_photos, oddities, photos_in, sharpness, some, stamps_in, write_frames
 
 
@@ -250,14 +250,12 @@ def test_many_names_are_cut_short() -> None:
     assert some([str(k) for k in range(10)]) == "0, 1, 2, 3, 4, 5, 6, 7 and 2 more"
 
 
-def test_panoramas_and_few_photos_have_their_own_words(tmp_path: Path) -> None:
-    sizes = {"a.png": (64, 32), "b.png": (32, 16), "c.png": (32, 24), "d.png": (32, 24)}
-    for name, size in sizes.items():
-        PIL.Image.new("RGB", size).save(tmp_path / name)
-    assert list(oddities(tmp_path, list(sizes))) == []  # a few may be cut so
-    (said,) = oddities(tmp_path, ["a.png", "b.png", "c.png", "a.png"])
+def test_panoramas_and_few_photos_have_their_own_words() -> None:
+    wide, usual = ImageHead((64, 32), 1, has_alpha=False), ImageHead((32, 24), 1, has_alpha=False)
+    assert list(oddities({"a.png": wide, "b.png": wide, "c.png": usual, "d.png": usual})) == []  # a few may be cut so
+    (said,) = oddities({"a.png": wide, "b.png": wide, "c.png": usual, "d.png": wide})
     assert "twice as wide as high: 360° panoramas must be cut" in said
-    (said,) = oddities(tmp_path, ["c.png", "d.png", "c.png"])
+    (said,) = oddities({"c.png": usual, "d.png": usual, "e.png": usual})
     assert said.startswith("3 photos are hardly enough")
 
 
@@ -273,6 +271,11 @@ def _photo(path: Path, seed: int = 0, focal: float | None = None, model: str = "
     return path.name
 
 
+def _extracted(scene: Path, names: list[str]) -> dict[str, str]:
+    heads = {name: image_head(scene / "images" / name) for name in names}
+    return reconstruct._extract(scene, heads, _silent, 400, 1)
+
+
 def test_photos_of_other_lenses_have_other_cameras(tmp_path: Path) -> None:
     images, photos = tmp_path / "images", {}
     for index, (name, focal, model) in enumerate(
@@ -281,21 +284,21 @@ def test_photos_of_other_lenses_have_other_cameras(tmp_path: Path) -> None:
         photos[name] = _photo(images / name, index, focal, model)
     _photo(images / "more/1.jpg", 9, 4.2)
     names = [*photos, "more/1.jpg"]
-    reconstruct._extract(tmp_path / "database.db", images, names, _silent, 400, 1)
-    found = dict(reconstruct._rows(tmp_path / "database.db", "select name, camera_id from images"))
+    _extracted(tmp_path, names)
+    found = dict(reconstruct._rows(tmp_path, "select name, camera_id from images"))
     assert found["1.jpg"] == found["2.png"]
     assert len({found[name] for name in names}) == 4
 
 
 def test_features_are_found_once_unless_a_photo_changes(tmp_path: Path) -> None:
-    database, images = tmp_path / "database.db", tmp_path / "images"
+    images = tmp_path / "images"
     names = [_photo(images / f"{seed}.png", seed) for seed in range(3)]
 
     def extract(names: list[str]) -> dict[str, Any]:
-        stamps = reconstruct._extract(database, images, names, _silent, 400, 1)
+        stamps = _extracted(tmp_path, names)
         assert list(stamps) == names
         assert stamps_in(tmp_path).items() >= stamps.items()
-        rows = reconstruct._rows(database, "select name, data from images join keypoints using (image_id)")
+        rows = reconstruct._rows(tmp_path, "select name, data from images join keypoints using (image_id)")
         return dict(rows)
 
     first = extract(names[:2])
@@ -310,11 +313,10 @@ def test_features_are_found_once_unless_a_photo_changes(tmp_path: Path) -> None:
 
 
 def test_stamps_of_a_database_that_is_gone_are_forgotten(tmp_path: Path) -> None:
-    database, images = tmp_path / "database.db", tmp_path / "images"
-    names = [_photo(images / f"{seed}.png", seed) for seed in range(2)]
-    reconstruct._extract(database, images, names, _silent, 400, 1)
+    names = [_photo(tmp_path / "images" / f"{seed}.png", seed) for seed in range(2)]
+    _extracted(tmp_path, names)
     reconstruct.remove_database(tmp_path)
-    reconstruct._extract(database, images, names[1:], _silent, 400, 1)
+    _extracted(tmp_path, names[1:])
     assert stamps_in(tmp_path).keys() == {names[1]}
 
 
@@ -330,7 +332,7 @@ def test_cameras_are_placed_again_for_other_photos_only(tmp_path: Path, monkeypa
     monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
 
     def placed(*names: str) -> int:
-        return len(reconstruct._map(tmp_path / "database.db", tmp_path, dict.fromkeys(names, "1"), _silent, 1))
+        return len(reconstruct._map(tmp_path, dict.fromkeys(names, "1"), _silent, 1))
 
     assert (placed("a", "b"), placed("a", "b"), placed("a")) == (1, 1, 1)
     assert asked == [{"a", "b"}, {"a"}]

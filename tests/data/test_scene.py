@@ -21,6 +21,7 @@ from transforms_scenes import write_blender, write_nerfstudio
 
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_models
 from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.data.images import ImageHead
 from nsvq_lightning.data.reconstruct import reconstruct
 from nsvq_lightning.data.scene import load_scene, usable
 from nsvq_lightning.training.module import SplatModule
@@ -256,7 +257,7 @@ def test_names_that_are_not_utf_8_are_refused(make_scene: SceneFactory) -> None:
     with pytest.raises(SceneError, match=r"--data\.root names '.*\\udcff', which is not UTF-8: rename"):
         load_scene(make_scene("plain").rename(root.with_name("scene\udcff")))
     with pytest.raises(SceneError, match=r"the scene to prepare names 'a\\udcff\.jpg', which is not UTF-8"):
-        reconstruct(root, ["a\udcff.jpg"], print)
+        reconstruct(root, {"a\udcff.jpg": ImageHead((1, 1), 1, has_alpha=False)}, print)
 
 
 def test_missing_image_folder(make_scene: SceneFactory) -> None:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from nsvq_lightning.compression.viewpoints import look_at
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
-from nsvq_lightning.rendering.frame import middle_of
 
 ELEVATIONS = (0.1, 0.5)
 """Elevations above the horizon in radians, y down, used in turn."""
@@ -27,8 +26,9 @@ def cameras_around(means: NDArray[np.float32], count: int, width: int = 800, hei
         width: Pixels.
         height: Pixels.
     """
-    middle, spread = middle_of(means)
-    reach = spread or 1.0
+    points = means.astype(np.float64)
+    middle = np.median(points, axis=0)
+    reach = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.8)) or 1.0
     usual = 2 * reach
     distance = max(usual, reach + 2 * NEAR)
     angle = 2 * math.atan(usual * math.tan(math.radians(30)) / distance)
