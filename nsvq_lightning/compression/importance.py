@@ -106,7 +106,8 @@ def _drawn(signs: torch.Generator, image: Tensor) -> Tensor:
 def below_cap(splats: SplatTensors) -> RawSplats:
     """The splats, detached, with opacities below the rasterizer's cap, where pixels have no gradient."""
     raw = detached(splats)
-    return raw._replace(opacities=raw.opacities.clamp_max(torch.logit(torch.tensor(ALPHA_MAX - 0.01)).item()))
+    limit = torch.logit(torch.tensor(ALPHA_MAX - 0.01)).item()
+    return raw._replace(opacities=raw.opacities.clamp_max(limit))
 
 
 def by_opacity(opacities: Tensor) -> Tensor:
@@ -130,7 +131,8 @@ def likely_effects(splats: RawSplats, squares: Tensor) -> Tensor:
     """
     effects = squares * by_opacity(splats.opacities).square()
     # An opaque splat shows more, a large one hardly: where splats are large, photos were taken from far away.
-    typical = splats.opacities.sigmoid().square() * (splats.scales.topk(2).values.sum(1) / 3).exp()
+    size = (splats.scales.topk(2).values.sum(1) / 3).exp()
+    typical = splats.opacities.sigmoid().square() * size
     typical *= (effects / typical)[effects > 0].median()
     counted = effects.fmax(MIN_EFFECT * typical)
     return counted**TRUST * typical ** (1 - TRUST)
@@ -155,7 +157,8 @@ def floaters(splats: SplatTensors, views: Callable[[], Iterable[View]], render: 
         rest = RawSplats(*(tensor[left] for tensor in raw))
         slope, curvature, error = removal_effects(rest, views(), render, generator(0, number, "floaters"))
         # Of a floater's opacity, the photos want at most a third; 0 of one in front of a finished scene.
-        gain = torch.where(slope < 2 * (1 / 3 - 1) * curvature, -slope - curvature, 0)
+        is_floater = slope < 2 * (1 / 3 - 1) * curvature
+        gain = torch.where(is_floater, -slope - curvature, 0)
         # A gain below this share of the squared error is not seen, and is noise.
         least = 1e-4 * error
         # Of splats in the same pixels, the worst goes first.

@@ -56,5 +56,6 @@ def setting_for(size: int, most: int, sh_degree: int) -> Setting:
         raise ValueError(f"{size} bytes leave room for {max(room, 0)} of {most} splats beside codebooks: allow more")
     codes, dim = sizes.get("shN", (0, 1))
     spare = max(0.0, 8 * size - fixed - most * (PLACE + bits))
-    more = min(spare / (dim * ATTRIBUTES["shN"].code_bits), codes, most / 8)
+    bits_a_code = dim * ATTRIBUTES["shN"].code_bits
+    more = min(spare / bits_a_code, codes, most / 8)
     return Setting(min(most, room), name, more=int(more))

@@ -71,7 +71,8 @@ def components(rows: Tensor, weights: Tensor, step: float) -> tuple[Float32s, Fl
     wide = rows.double()
     spread = (wide * weights[:, None]).T @ wide
     axes = torch.linalg.eigh(spread)[1].flip(1).T
-    size = step * math.sqrt(float(spread.trace()) / rows.numel()) or 1.0
+    usual = math.sqrt(float(spread.trace()) / rows.numel())
+    size = step * usual or 1.0
     unit = 2.0 ** round(math.log2(size / FINENESS))
     basis = (axes * (size / unit)).round() * unit
     # What each coefficient would be.
@@ -101,9 +102,11 @@ def _cheapest(places: Tensor, before: Tensor, worth: Tensor) -> Tensor:
     nearest = places.round()
     if not nearest.any():
         return nearest
-    most = int(torch.maximum(nearest.abs(), before.abs()).max())
-    counts = torch.bincount((before + most).long(), minlength=2 * most + 1)
+    largest = int(torch.maximum(nearest.abs(), before.abs()).max())
+    counts = torch.bincount((before + largest).long(), minlength=2 * largest + 1)
     bits = math.log2(len(places) + 1) - (counts + 0.5).log2()
-    choices = torch.stack([nearest, nearest - nearest.sign(), torch.zeros_like(nearest)])
-    costs = worth * (places - choices).square() + bits[(choices + most).long()]
+    nearer_0 = nearest - nearest.sign()
+    choices = torch.stack([nearest, nearer_0, torch.zeros_like(nearest)])
+    distances = (places - choices).square()
+    costs = worth * distances + bits[(choices + largest).long()]
     return choices.gather(0, costs.argmin(0, keepdim=True))[0]

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +34,14 @@ def look_at(target: Float64s, eye: Float64s, width: int, height: int, angle: flo
     """
     view = view_towards(target, eye, np.array([0.0, -1.0, 0.0]))
     focal = 0.5 * width / math.tan(angle / 2)
-    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
+    intrinsics = torch.tensor(
+        [
+            [focal, 0, width / 2],
+            [0, focal, height / 2],
+            [0, 0, 1],
+        ],
+        dtype=torch.float64,
+    )
     near = NEARNESS * float(np.linalg.norm(target - eye))
     return Camera(intrinsics, view, width, height, near or NEAR)
 
@@ -82,22 +88,6 @@ class Measure:
         return math.sqrt(np.mean([float(difference.double().square().mean()) for difference in differences]))
 
 
-@dataclass(frozen=True)
-class _Rendered:
-    """A picture of a scene in place of a photo."""
-
-    picture: Picture
-    mask: None = None
-    has_alpha: bool = False
-
-    @property
-    def nbytes(self) -> int:
-        return self.picture.nbytes
-
-    def load(self) -> Picture:
-        return self.picture
-
-
 def own_scene(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool = False) -> Scene:
     """A scene whose photos are pictures of splats, all of them to train on.
 
@@ -106,7 +96,7 @@ def own_scene(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool
         cameras: Where from, at least one.
         antialiased: Whether the splats are to be rendered with anti-aliasing.
     """
-    photos = ((255 * picture).round().to(torch.uint8) for picture in pictures(splats, cameras, antialiased))
+    photos = [(255 * picture).round().to(torch.uint8) for picture in pictures(splats, cameras, antialiased)]
     centres = poses(cameras)[0]
     frame = Frame.around(centres)
     if not np.ptp(centres, axis=0).any():
@@ -116,7 +106,7 @@ def own_scene(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool
         root=Path("own pictures"),
         names=tuple(f"{number:03d}" for number in range(len(cameras))),
         cameras=tuple(cameras),
-        images=ImageStore([_Rendered(Picture(photo, None)) for photo in photos]),  # type: ignore[misc]
+        images=ImageStore.holding([Picture(photo, None) for photo in photos]),
         points=splats.means.detach(),
         colors=torch.zeros_like(splats.means),
         train=tuple(range(len(cameras))),
@@ -153,7 +143,8 @@ def likely_cameras(
     angle = math.radians(degrees)
     means = splats.means.detach().double().cpu().numpy()
     # Small, opaque splats are where the detail is.
-    detail = torch.sigmoid(splats.opacities.detach()).double() * torch.exp(-splats.scales.detach().double().mean(1))
+    opacities = torch.sigmoid(splats.opacities.detach()).double()
+    detail = opacities * torch.exp(-splats.scales.detach().double().mean(1))
     weights = (detail / detail.sum()).cpu().numpy()
     middle = weights @ means
     reach = math.sqrt(weights @ ((means - middle) ** 2).sum(1)) or 1.0
@@ -161,10 +152,12 @@ def likely_cameras(
     draws = np.random.default_rng(seed)
     directions = draws.standard_normal((candidates, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    eyes = middle + reach * draws.uniform(1.5, 3.0, (candidates, 1)) * directions
+    distances = reach * draws.uniform(1.5, 3.0, (candidates, 1))
+    eyes = middle + distances * directions
     targets = middle + reach * 0.6 * draws.standard_normal((candidates, 3))
     across, up, _ = np.abs(eyes - targets).T
-    eyes[:, 0] += np.where(across < 0.05 * up, 0.2 * up, 0.0)  # straight up or down, a camera has no upright
+    # Straight up or down, a camera has no upright.
+    eyes[:, 0] += np.where(across < 0.05 * up, 0.2 * up, 0.0)
     low = round(96 * height / width)
     views = zip(targets, eyes, strict=True)
     scores = [_detail(splats, look_at(target, eye, 96, low, angle)) for target, eye in views]

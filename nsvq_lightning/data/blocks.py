@@ -53,7 +53,8 @@ class Block:
         """
         ground = points.astype(np.float64) @ np.array(self.axes).T
         low, high = (1 - share) * np.array(self.core) + share * np.array(self.around)
-        return np.asarray(((ground >= low) & (ground < high)).all(1))
+        inside: Bools = ((ground >= low) & (ground < high)).all(1)
+        return inside
 
     @classmethod
     def read(cls, folder: Path) -> "Block":
@@ -126,19 +127,20 @@ def cut(scene: Scene, count: int) -> list[Block]:
     root = str(scene.root.resolve())
 
     def parts(some: Bools, core: Float64s, around: Float64s, number: int) -> list[Block]:
-        places, weights = ground[some], shown[some]
+        places = ground[some]
+        weights = shown[some]
         if np.count_nonzero(weights) < 4 * number:
             raise SceneError(f"the photos show too few points of {scene.root} for {count} parts: ask for fewer")
         if number == 1:
             return [Block(axes.tolist(), core.tolist(), around.tolist(), root)]
         spread = [np.subtract(*_quantiles(column, weights, (0.95, 0.05))) for column in places.T]
-        axis = int(np.argmax(spread))
+        axis = np.argmax(spread)
         along = places[:, axis]
         first = number // 2
         shares = np.array([first - OVERLAP, first - SLACK, first + SLACK, first + OVERLAP]) / number
         lower, start, stop, upper = _quantiles(along, weights, shares)
         near = np.sort(along[(along >= start) & (along <= stop)])
-        gap = int(np.diff(near, append=near[-1]).argmax())
+        gap = np.diff(near, append=near[-1]).argmax()
         seam = near[gap : gap + 2].mean()
         reach = OVERLAP * spread[axis] / number
         below = ground[:, axis] < seam
@@ -161,7 +163,8 @@ def cut(scene: Scene, count: int) -> list[Block]:
 def _quantiles(values: Float64s, weights: Float64s, shares: Sequence[float] | Float64s) -> Float64s:
     order = values.argsort()
     sums = weights[order].cumsum()
-    return np.asarray(values[order][np.searchsorted(sums, np.array(shares) * sums[-1])])
+    found: Float64s = values[order][sums.searchsorted(np.array(shares) * sums[-1])]
+    return found
 
 
 # What of the surroundings counts as at the seam.
@@ -170,7 +173,8 @@ _SEAM = 0.3
 
 def near_seams(points: Float64s, blocks: Sequence[Block]) -> Bools:
     """Which points ``[P, 3]`` lie where two parts meet."""
-    return np.asarray(sum(block.contains(points, _SEAM).astype(int) for block in blocks) > 1)
+    parts = sum(block.contains(points, _SEAM) for block in blocks)
+    return np.asarray(parts > 1)
 
 
 # A point in a file: its position, then its colour.
@@ -287,8 +291,8 @@ def _write_photo(folder: Path, index: int, image: Uint8s, mask: Bools, camera: C
         "h": height,
         "fl_x": fx,
         "fl_y": fy,
-        "cx": cx - float(left),
-        "cy": cy - float(top),
+        "cx": cx - left,
+        "cy": cy - top,
         "transform_matrix": pose.tolist(),
     }
 

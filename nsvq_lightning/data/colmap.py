@@ -55,7 +55,7 @@ class ColmapImage:
     @property
     def centre(self) -> Float64s:
         """Where the camera is ``[3]``, scene units."""
-        return np.asarray(-self.viewmat[:3, :3].T @ self.viewmat[:3, 3])
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +202,9 @@ def model_files(root: Path, chosen: str | None = None) -> dict[str, Path]:
     Raises:
         SceneError: There is none, or there are several where nobody looks first.
     """
-    folders = FOLDERS if chosen is None else (f"sparse/{chosen}" if chosen.isdecimal() else chosen,)
+    folders: Sequence[str] = FOLDERS
+    if chosen is not None:
+        folders = [f"sparse/{chosen}" if chosen.isdecimal() else chosen]
     files = find_model(root, folders)
     if files is not None:
         return files
@@ -287,13 +289,13 @@ def _viewmats(rows: Sequence[tables.ImageRow], path: Path) -> Float64s:
     Raises:
         SceneError: A pose is not finite or its quaternion is 0, or a photo has two poses.
     """
-    quats = np.array([row.quat for row in rows])
-    places = np.array([row.translation for row in rows])
+    poses = np.array([row.pose for row in rows])
+    quats = poses[:, :4]
     norms = np.linalg.norm(quats, axis=1)
-    usable = (norms > 0) & (np.abs(np.c_[quats, places]) <= MAX_NUMBER).all(1)
+    usable = (norms > 0) & (np.abs(poses) <= MAX_NUMBER).all(1)
     if not usable.all():
-        first = rows[int(usable.argmin())]
-        pose = f"quaternion {list(first.quat)} and translation {list(first.translation)}"
+        first = rows[usable.argmin()]
+        pose = f"quaternion {list(first.pose[:4])} and translation {list(first.pose[4:])}"
         raise SceneError(
             f"{path}: {(~usable).sum()} poses are no numbers, not finite or without rotation; the first is that of "
             f"{first.name} with {pose}: remove it from the model, or run COLMAP again"
@@ -304,12 +306,12 @@ def _viewmats(rows: Sequence[tables.ImageRow], path: Path) -> Float64s:
                 f"{path} lists {one.name} twice, as images {one.number} and {other.number}: give photos names of their "
                 "own, and run COLMAP again"
             )
-    worst = float(np.abs(norms - 1).max())
+    worst = np.abs(norms - 1).max()
     if worst > _ROUNDED:
         log.warning("%s: quaternions are up to %.2g %% too long or short; they are normalised", path, 100 * worst)
     viewmats = np.tile(np.eye(4), (len(rows), 1, 1))
     viewmats[:, :3, :3] = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
-    viewmats[:, :3, 3] = places
+    viewmats[:, :3, 3] = poses[:, 4:]
     return viewmats
 
 
@@ -359,7 +361,7 @@ def rgb_bytes(values: Float64s, floats: bool = False) -> Uint8s:
         floats: Whether they may be fractions even if all are 0 or 1.
     """
     values = np.nan_to_num(values)
-    largest = float(values.max(initial=0))
+    largest = values.max(initial=0)
     scale = 1.0
     if largest <= 1 and (floats or (values % 1 != 0).any()):
         scale = 255
@@ -391,7 +393,8 @@ def alignment(model: ColmapModel, other: ColmapModel) -> Float64s:
 def _no_model(root: Path, folders: Sequence[str], chosen: str | None) -> SceneError:
     """What to say of a folder without a model."""
     found = [path for folder in folders for path in (root / folder).glob("*.*") if path.stem in TABLES]
-    where, advice = root, "nor is there a transforms.json: make a scene with nsvq prepare, or copy the missing files"
+    where = root
+    advice = "nor is there a transforms.json: make a scene with nsvq prepare, or copy the missing files"
     if chosen is not None:
         where = root / folders[0]
         advice = f"choose another (--data.model); there is {', '.join(other_models(root)) or 'none in the folder'}"

@@ -30,8 +30,7 @@ class ImageRow(NamedTuple):
     """An image: its identifier, pose from world to camera (quaternion wxyz of any norm, scene units), camera, name."""
 
     number: int
-    quat: tuple[float, ...]
-    translation: tuple[float, ...]
+    pose: tuple[float, ...]
     camera_id: int
     name: str
 
@@ -187,8 +186,7 @@ def _image_record(data: mmap.mmap, start: int) -> tuple[ImageRow, int]:
         raise struct.error("its name does not end")
     name = data[start + _IMAGE.size : end].decode(errors="surrogateescape")
     (points,) = _U64.unpack_from(data, end + 1)
-    row = ImageRow(number, tuple(pose[:4]), tuple(pose[4:]), camera_id, name)
-    return row, end + 1 + _U64.size + 24 * int(points)
+    return ImageRow(number, tuple(pose), camera_id, name), end + 1 + _U64.size + 24 * int(points)
 
 
 def _point_record(data: mmap.mmap, start: int, tracks: bool) -> tuple[_Point, int]:
@@ -201,15 +199,13 @@ def _point_record(data: mmap.mmap, start: int, tracks: bool) -> tuple[_Point, in
     return (*values, *images), end
 
 
-def _encoding(path: Path) -> str:
-    """UTF-8 with or without a mark, or UTF-16, which PowerShell writes."""
-    with path.open("rb") as file:
-        return "utf-16" if file.read(2) in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
-
-
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """The lines of a text table with their numbers, without comments and empty ones."""
-    with path.open(encoding=_encoding(path), errors="surrogateescape") as file:
+    with path.open("rb") as file:
+        start = file.read(2)
+    # UTF-8 with or without a mark, or UTF-16, which PowerShell writes.
+    encoding = "utf-16" if start in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    with path.open(encoding=encoding, errors="surrogateescape") as file:
         for number, line in enumerate(file, 1):
             text = line.strip()
             if text and not text.startswith("#"):
@@ -257,7 +253,7 @@ def _image_lines(path: Path) -> Iterator[ImageRow]:
         if len(words) < 10:
             raise ValueError(f"line {line} has {len(words)} words; an image has identifier, pose of 7, camera, name")
         number, *pose, camera_id = _numbers(line, words[:9])
-        yield ImageRow(int(number), tuple(pose[:4]), tuple(pose[4:]), int(camera_id), words[9])
+        yield ImageRow(int(number), tuple(pose), int(camera_id), words[9])
         after_image = True
 
 

@@ -32,11 +32,13 @@ def view_order(n_views: int, seed: int, rank: int = 0, world_size: int = 1, star
         world_size: Number of processes.
         start: Draw at which iteration starts.
     """
-    current, order = -1, torch.empty(0, dtype=torch.int64)
+    current = -1
+    order = torch.empty(0)
     for draw in count(start):
         epoch, position = divmod(draw * world_size + rank, n_views)
         if epoch != current:
-            current, order = epoch, torch.randperm(n_views, generator=generator(seed, epoch, "views"))
+            current = epoch
+            order = torch.randperm(n_views, generator=generator(seed, epoch, "views"))
         yield int(order[position])
 
 
@@ -51,7 +53,8 @@ class DevicePhotos:
     """
 
     def __init__(self, most_bytes: int) -> None:
-        self._most, self._free = most_bytes, 0
+        self._most = most_bytes
+        self._free = 0
         self._device = torch.device("cpu")
         self._kept: dict[int, View] = {}
 
@@ -60,11 +63,14 @@ class DevicePhotos:
         if device.type == "cpu":
             return view.to(device)
         if device != self._device:
-            self._device, self._kept, self._free = device, {}, min(self._most, _spare(device))
+            self._device = device
+            self._kept = {}
+            self._free = min(self._most, _spare(device))
         if view.index in self._kept:
             return self._kept[view.index]
         moved = view.to(device)
-        if (taken := Picture(moved.image, moved.mask).nbytes) <= self._free:
+        taken = Picture(moved.image, moved.mask).nbytes
+        if taken <= self._free:
             self._kept[view.index] = moved
             self._free -= taken
         return moved
@@ -95,7 +101,8 @@ class SceneDataModule(LightningDataModule):
     def __init__(self, scene: Scene | Callable[[], Scene], seed: int = 0, cache_bytes: int = 4 << 30) -> None:
         super().__init__()
         self.seed = seed
-        self._scene, self._photos = scene, DevicePhotos(cache_bytes)
+        self._scene = scene
+        self._photos = DevicePhotos(cache_bytes)
 
     @cached_property
     def scene(self) -> Scene:
@@ -162,9 +169,9 @@ class SceneDataModule(LightningDataModule):
 
     def _ordered(self, indices: Sequence[int]) -> DataLoader[View]:
         rank, world_size = self.process
-        views = _OrderedViews(self.scene, indices, stride=world_size)
+        views = _OrderedViews(self.scene, indices, world_size)
         # Lightning leaves a DistributedSampler alone, whatever use_distributed_sampler says; this one pads nothing.
-        sampler = UnrepeatedDistributedSampler(views, num_replicas=world_size, rank=rank, shuffle=False)
+        sampler = UnrepeatedDistributedSampler(views, world_size, rank, shuffle=False)
         return DataLoader(views, batch_size=None, sampler=sampler)
 
 
@@ -202,7 +209,7 @@ class ColmapDataModule(SceneDataModule):
     ) -> None:
         settings = factor, max_width, test_every, cache_bytes, images_folder, model, masks, allow_outside
         super().__init__(partial(load_scene, root, *settings), seed, cache_bytes)
-        self.root, self.cache_bytes = Path(root).expanduser(), cache_bytes
+        self.root = Path(root).expanduser()
 
 
 class DemoDataModule(ColmapDataModule):
@@ -224,8 +231,8 @@ class _TrainViews(IterableDataset[View]):
         self._data = data
 
     def __iter__(self) -> Iterator[View]:
-        scene, (rank, world_size) = self._data.scene, self._data.process
-        order = view_order(len(scene.train), self._data.seed, rank, world_size, self._data.draw)
+        scene = self._data.scene
+        order = view_order(len(scene.train), self._data.seed, *self._data.process, self._data.draw)
         for current, following in pairwise(order):
             scene.images.prefetch(scene.train[following])
             yield scene.view(scene.train[current])
@@ -235,14 +242,17 @@ class _OrderedViews(Dataset[View]):
     """Given views of a scene; each access starts decoding the one ``stride`` further on."""
 
     def __init__(self, scene: Scene, indices: Sequence[int], stride: int) -> None:
-        self._scene, self._indices, self._stride = scene, indices, stride
+        self._scene = scene
+        self._indices = indices
+        self._stride = stride
 
     def __len__(self) -> int:
         return len(self._indices)
 
     def __getitem__(self, position: int) -> View:
-        if position + self._stride < len(self):
-            self._scene.images.prefetch(self._indices[position + self._stride])
+        following = position + self._stride
+        if following < len(self):
+            self._scene.images.prefetch(self._indices[following])
         return self._scene.view(self._indices[position])
 
 

@@ -1,6 +1,7 @@
 """Points where the photos have detail, from the optical flow between neighbouring train photos."""
 
 import itertools
+import math
 from typing import NamedTuple
 
 import cv2
@@ -86,7 +87,7 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
         photos = in_parallel(lambda index: _photo(scene, index, known), scene.train, "dense start: photos")
         pairs = _neighbours(photos)
         pixels = 2 * len(pairs) * photos[0].grey.size
-        stride = max(2, int(np.ceil(np.sqrt(pixels / MAX_CANDIDATES))))
+        stride = max(2, math.ceil(math.sqrt(pixels / MAX_CANDIDATES)))
         found = in_parallel(lambda pair: _triangulated(*pair, stride), pairs, "dense start: flows")
     finally:
         cv2.setNumThreads(threads)
@@ -111,18 +112,20 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
 
 
 # Photos are looked at with at most so many pixels on their longer side.
-LONGEST = 800
+MAX_SIDE = 800
 
 
 def _photo(scene: Scene, index: int, known: Float64s) -> _Photo:
     camera = scene.cameras[index]
     image, mask = scene.images[index]
-    scale = min(1.0, LONGEST / max(camera.width, camera.height))
-    width, height = round(camera.width * scale), round(camera.height * scale)
+    scale = min(1.0, MAX_SIDE / max(camera.width, camera.height))
+    width = round(camera.width * scale)
+    height = round(camera.height * scale)
     pixels, counts = resized(image.numpy(), None if mask is None else mask.numpy(), (width, height))
     edges = edges_of(torch.from_numpy(pixels), None if counts is None else torch.from_numpy(counts))
     view = camera.viewmat.numpy().astype(np.float64)
-    rotation, translation = view[:3, :3], view[:3, 3]
+    rotation = view[:3, :3]
+    translation = view[:3, 3]
     size = np.array([width / camera.width, height / camera.height])
     depths = known @ rotation[2] + translation[2]
     ahead = depths[depths > 0]

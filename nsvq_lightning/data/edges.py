@@ -34,18 +34,18 @@ def edges_of(image: Tensor, mask: Tensor | None = None) -> Edges:
         image: ``[H, W, 3]`` uint8 RGB.
         mask: Which pixels count ``[H, W]`` bool; those beside one that does not have strength 0. None if all count.
     """
-    values = torch.from_numpy(high_pass(image, cv2.CV_8U, mask))  # which also clips to 0..255
+    values = torch.from_numpy(high_pass(image, mask, cv2.CV_8U))  # which also clips to 0..255
     values = values - values.min()
     return Edges(values, max(int(values.max()), 1))
 
 
-def high_pass(image: Tensor, depth: int, mask: Tensor | None) -> NDArray[Any]:
+def high_pass(image: Tensor, mask: Tensor | None, depth: int) -> NDArray[Any]:
     """Eight times the grey value of each pixel less those of its neighbours, 0 beside pixels that do not count.
 
     Args:
         image: ``[H, W, 3]`` uint8 RGB.
-        depth: OpenCV's name of the type of the result.
         mask: Which pixels count ``[H, W]`` bool; None if all do.
+        depth: OpenCV's name of the type of the result.
     """
     grey = cv2.cvtColor(image.cpu().numpy(), cv2.COLOR_RGB2GRAY)
     kernel = np.full((3, 3), -1, np.float32)

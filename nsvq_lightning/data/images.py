@@ -172,7 +172,7 @@ def read_mask(path: Path, width: int, height: int) -> Bools:
         levels = pixels[..., 3]
     elif np.ptp(colours, axis=2).max() > levels.max() / 16:
         black = 1 / 32  # also after JPEG
-    bright = levels > black * int(levels.max())
+    bright = levels > black * levels.max()
     if not same_shape(bright.shape[::-1], (width, height)):
         raise SceneError(
             f"mask {path} is of {bright.shape[1]}x{bright.shape[0]}, its photo of {width}x{height}, another shape: "
@@ -311,6 +311,14 @@ class ImageStore:
         self._kept: dict[int, Picture] = {}
         self._edges: dict[int, Edges] = {}
         self._coming: dict[int, Future[Picture]] = {}
+
+    @classmethod
+    def holding(cls, pictures: Sequence[Picture]) -> "ImageStore":
+        """Pictures that are there already and need no file."""
+        store = cls(())
+        store._kept = dict(enumerate(pictures))
+        store.nbytes = sum(picture.nbytes for picture in pictures)
+        return store
 
     def __getitem__(self, index: int) -> Picture:
         """Picture ``index`` on the CPU; treat it as read-only.

@@ -171,9 +171,10 @@ def find_masks(
         raise SceneError(f"{len(lost)} masks do not exist, first {lost[0]}: copy them, or remove mask_path")
     relative = [str(path.relative_to(photos)) if path.is_relative_to(photos) else path.name for path in files]
     named = [(image.name, name) for image, name in zip(images, relative, strict=True)]
+    has_own = any(given)
     usual = [root / name for name in folders if (root / name).is_dir()][:1]
     places = usual
-    if not usual and not any(given) and folders[-1] == "masks":
+    if not usual and not has_own and folders[-1] == "masks":
         places = [path for path in sorted(root.glob("*")) if path.is_dir() and "mask" in path.name.lower()]
         places.append(photos)
     found = {place: masks for place in places if any(masks := _masks_in(place, named, beside=place == photos))}
@@ -185,11 +186,11 @@ def find_masks(
         return [own or other for own, other in zip(given, masks, strict=True)]
     if found:
         log.warning("masks in %s are not used: choose a folder (--data.masks)", shown)
-    elif usual and not any(given):
+    elif usual and not has_own:
         name = Path(relative[0])
         png = name.with_suffix(".png")
         log.warning("%s has no mask of any photo: that of %s would be %s.png or %s", shown, name, name, png)
-    elif not places and not any(given):
+    elif not places and not has_own:
         log.warning("there is no folder %s: no photo has a mask", root / folders[-1])
     elif any(path.name.startswith("dynamic_mask_") for path in photos.glob("*")):
         log.warning("dynamic_mask_* in %s are not used: white leaves out in them; put inverted ones in masks/", photos)

@@ -74,7 +74,7 @@ def cloud_in(folders: list[Path]) -> Path | None:
 
 def share_seen(points: Float64s, cameras: list[Camera]) -> float:
     """Mean share of the cameras that have a point in their picture, walls disregarded."""
-    return float(_sightings(points, cameras).mean() / len(cameras)) if len(points) else 0.0
+    return float(_sightings(points, cameras).sum()) / max(1, len(points) * len(cameras))
 
 
 # Points of a scene that comes without.
@@ -100,7 +100,9 @@ def random_points(cameras: list[Camera]) -> Float64s:
     across, down, away = torch.rand(3, count, generator=draws, dtype=torch.float64).numpy()
     fx, fy, cx, cy = np.array([camera.intrinsics for camera in cameras])[chosen].T
     width, height = np.array([(camera.width, camera.height) for camera in cameras])[chosen].T
-    rays = np.stack([(across * width - cx) / fx, (down * height - cy) / fy, np.ones(count)], axis=1)
+    x = (across * width - cx) / fx
+    y = (down * height - cy) / fy
+    rays = np.stack([x, y, np.ones(count)], axis=1)
     local = rays * (2 * distance * away)[:, None]
     points = centres[chosen] + np.einsum("pij,pj->pi", rotations.as_matrix()[chosen], local)
     order = np.argsort(-_sightings(points, cameras), kind="stable")

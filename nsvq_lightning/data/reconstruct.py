@@ -405,8 +405,9 @@ TO_CONVERT = (
     "compatible\"; HEIC is read after 'pip install pillow-heif'"
 )
 JPEG_QUALITY = 95
-# What Pillow calls the formats that COLMAP reads, and those of converted photos that stay without losses.
-COLMAP_READS, LOSSLESS = ("JPEG", "MPO", "PNG", "TIFF", "BMP"), ("PNG", "TIFF", "BMP")
+# What Pillow calls the formats of photos that stay without losses when they are converted, and those that COLMAP reads.
+LOSSLESS = ("PNG", "TIFF", "BMP")
+COLMAP_READS = ("JPEG", "MPO", *LOSSLESS)
 
 
 def _copy(path: Path, target: Path) -> Path:
@@ -488,7 +489,7 @@ def write_frames(video: Path, folder: Path, count: int, report: Report) -> list[
     for _, part in itertools.groupby(frames, key=lambda frame: frame[0] * parts // total):
         number, picture = max(part, key=lambda frame: sharpness(frame[1]))
         tiny = cv2.resize(picture, (48, 27), interpolation=cv2.INTER_AREA).astype(np.float32)
-        if last is not None and float(np.abs(tiny - last).mean()) < STILL:
+        if last is not None and np.abs(tiny - last).mean() < STILL:
             continue
         names.append(f"frame_{number:06d}.jpg")
         written = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]

@@ -182,7 +182,8 @@ def load_scene(
         raise ValueError(f"test_every must be at least 2 (1 leaves no train view), got {test_every}")
     root = Path(root).expanduser()
     poses = read_poses(root, model, allow_outside=allow_outside)
-    if model is None and poses.source == "COLMAP" and (larger := larger_models(root)) is not None:
+    larger = larger_models(root) if model is None and poses.source == "COLMAP" else None
+    if larger is not None:
         log.warning("%s: %s", root, larger)
     views = range(len(poses.images))
     test = tuple(views[::test_every])
@@ -255,7 +256,9 @@ def _image_sources(
     model: ColmapModel, paths: list[Path], masks: list[Path | None], divisor: int, max_width: int | None
 ) -> list[ImageSource]:
     """One source per view; views with the same camera and file size share their undistortion."""
-    heads, kinds, others = [], [], 0
+    heads = []
+    kinds = []
+    others = 0
     for image, path in zip(model.images, paths, strict=True):
         camera = model.cameras[image.camera_id]
         head = _head_for(path, (camera.width, camera.height))
@@ -344,7 +347,7 @@ def _framed(model: ColmapModel, root: Path) -> tuple[ColmapModel, Frame]:
     if len(lost):
         first = model.images[lost[0]].name
         log.warning("%d photos are far from all others, first %s: check its pose, or leave it out", len(lost), first)
-    distance = float(np.linalg.norm(frame.middle)) / (EXTENT * frame.unit)
+    distance = np.linalg.norm(frame.middle) / (EXTENT * frame.unit)
     if distance < _FARTHEST:
         return model, frame
     log.info("%s: positions are relative to %s, as 0 is %.0f extents away", root, frame.middle, distance)
@@ -362,7 +365,9 @@ def _astray(places: Float64s, times: float) -> Bools:
         times: As far as four fifths of them, from where on they are astray.
     """
     finite = places[np.isfinite(places).all(1)]
-    middle, usual = middle_of(finite) if len(finite) else (np.zeros(3), 0.0)
+    if not len(finite):
+        return np.zeros(len(places), bool)
+    middle, usual = middle_of(finite)
     with np.errstate(invalid="ignore"):
         distances = np.linalg.norm(places - middle, axis=1)
     return np.asarray((distances > times * usual) & (usual > 0))
@@ -409,5 +414,5 @@ def detailed_pixels(scene: Scene) -> float:
         SceneError: An image cannot be decoded.
     """
     pictures = (scene.images[index] for index in scene.some_train(_SAMPLE))
-    counts = [int((np.abs(high_pass(image, cv2.CV_16S, mask)) > _DETAIL).sum()) for image, mask in pictures]
+    counts = [np.count_nonzero(np.abs(high_pass(*picture, cv2.CV_16S)) > _DETAIL) for picture in pictures]
     return sum(counts) / len(counts)

@@ -42,9 +42,10 @@ def read_poses(
     """
     root = root.expanduser()
     check_name(str(root.resolve()), "--data.root", allow_outside=True)
-    files = [root / model] if model is not None and model.endswith(".json") else []
-    if model is None and colmap.find_model(root) is None:
-        files = _files_in(root)
+    if model is None:
+        files = [] if colmap.find_model(root) else _files_in(root)
+    else:
+        files = [root / model] if model.endswith(".json") else []
     if files:
         poses = _read_transforms(root, files, allow_outside)
         return poses if len(poses.points) else _with_colmap_points(poses, root)

@@ -86,14 +86,12 @@ class Undistortion:
         columns, rows, blank = self.maps()
         # replicate the border, so that the cubic kernel does not mix black into the edge of the crop
         result: Uint8s = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        count = None
+        result[blank] = 0
+        count = ~blank
         if kept is not None:
-            whole = kept.astype(np.uint8) * np.uint8(255)
-            count = cv2.remap(whole, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) == 255
-        if blank.any():
-            result[blank] = 0
-            count = ~blank if count is None else count & ~blank
-        return result, count
+            whole = kept.view(np.uint8) * np.uint8(255)
+            count &= cv2.remap(whole, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) == 255
+        return result, None if count.all() else count
 
     def maps(self) -> Maps:
         """Where each pixel of the pinhole image comes from."""

@@ -33,8 +33,7 @@ def test_images_as_text(tmp_path: Path, change: Callable[[str], str], encoding: 
     path.write_bytes(change(TWO_LINES).encode(encoding))
     images = read_images(path)
     assert [image.name for image in images] == NAMES
-    assert images[1].quat == (1, 0, 0, 0)
-    assert images[1].translation == (0.5, -0.01, 2)
+    assert images[1].pose == (1, 0, 0, 0, 0.5, -0.01, 2)
     assert [(image.number, image.camera_id) for image in images] == [(1, 1), (2, 1)]
 
 

@@ -116,7 +116,7 @@ def test_pixels_that_do_not_count_give_no_points() -> None:
 
 
 def test_photos_of_several_cameras_and_of_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dense_start, "LONGEST", 200)
+    monkeypatch.setattr(dense_start, "MAX_SIDE", 200)
     sizes = [(256, 192, 230.0), (200, 150, 185.0), (256, 200, 230.0), (240, 192, 220.0), (320, 240, 290.0)]
     views = [wall(*size, x=x) for x, size in zip(PLACES, sizes, strict=True)]
     points, _ = dense_points(scene_of(views), 1000, seed=0)
