@@ -154,7 +154,8 @@ def cut(scene: Scene, count: int) -> list[Block]:
             return parts(some & inside, inner, outer, share)
 
         low = side(below, 1, min(upper, seam + reach), first)
-        return low + side(~below, 0, max(lower, seam - reach), number - first)
+        high = side(~below, 0, max(lower, seam - reach), number - first)
+        return low + high
 
     everywhere = np.array([[-_FAR] * 2, [_FAR] * 2])
     return parts(np.ones(len(points), bool), everywhere, everywhere, count)
@@ -273,15 +274,13 @@ def shown(front: _Front, inside: Bools, camera: Camera) -> Bools:
 
 def _write_photo(folder: Path, index: int, image: Uint8s, mask: Bools, camera: Camera) -> dict[str, Any]:
     """Write what a photo shows of a part, and its mask; returns its frame in ``transforms.json``."""
-    top, bottom = np.flatnonzero(mask.any(1))[[0, -1]]
-    left, right = np.flatnonzero(mask.any(0))[[0, -1]]
-    box = slice(top, bottom + 1), slice(left, right + 1)
+    left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+    box = slice(top, top + height), slice(left, left + width)
     photo = f"images/{index:05}.png"
     _write_png(folder / photo, image[box][..., ::-1])
     kept = f"masks/{index:05}.png"
     _write_png(folder / kept, 255 * mask[box].astype(np.uint8))
     fx, fy, cx, cy = camera.intrinsics
-    height, width = mask[box].shape
     # The file has the inverse, y up, z backward.
     pose = np.linalg.inv(camera.viewmat.double().numpy()) * (1, -1, -1, 1)
     return {

@@ -363,11 +363,14 @@ def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
         if any((folder / parent / RECORD).is_file() for parent in inside.parents[:-1]):
             continue  # a scene, made of photos that are here
         if path.parent != files[0].parent == folder:
-            left["in a folder beside the photos: give it alone, or put all photos into folders"].append(str(inside))
+            reason = "in a folder beside the photos: give it alone, or put all photos into folders"
         elif any(map(OTHER.fullmatch, inside.parts[:-1])):
-            left["no photos by the name of their folder"].append(str(inside))
+            reason = "no photos by the name of their folder"
         elif taken.setdefault(str(inside.with_suffix("")).casefold(), path) != path:
-            left["another file of that name is taken"].append(str(inside))
+            reason = "another file of that name is taken"
+        else:
+            continue
+        left[reason].append(str(inside))
     if not taken:
         raise SceneError(f"{folder}: no photos; it must hold files that end in {', '.join(PHOTOS)}, or folders of them")
     return sorted(taken.values()), left
@@ -456,7 +459,7 @@ def some(names: Sequence[str]) -> str:
 
 def sharpness(picture: MatLike) -> float:
     """Variance of the Laplacian of a picture, reduced to the same width whatever its size: more is sharper."""
-    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.ndim == 3 else picture
+    grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     factor = min(1.0, 480 / grey.shape[1])  # noise is no sharpness
     small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(small, cv2.CV_64F).var())

@@ -125,10 +125,10 @@ class _Frame:
             raise self.error(f"has {key} = {value!r}, which is no finite number")
         return float(value)
 
-    def path(self, key: str) -> str | None:
-        """A path that it gives, with slashes; None if it gives none."""
+    def path(self, key: str) -> str:
+        """A path that it gives, with slashes; empty if it gives none."""
         given = self.values.get(key)
-        return _plain(given) if isinstance(given, str) and given else None
+        return _plain(given) if isinstance(given, str) and given else ""
 
     @property
     def name(self) -> str:
@@ -270,7 +270,7 @@ def _frames(file: Path, allow_outside: bool) -> tuple[dict[str, Any], dict[str, 
             raise SceneError(f"{file}: frame {position} is no table of values: export the file again")
         values = {key: value for key, value in (shared | own).items() if value is not None}
         frame = _Frame(file, position, values)
-        if frame.path("file_path") is None:
+        if not frame.path("file_path"):
             raise frame.error("has no file_path")
         given.append(frame)
     photos, masks = (
@@ -279,8 +279,7 @@ def _frames(file: Path, allow_outside: bool) -> tuple[dict[str, Any], dict[str, 
     )
     frames: dict[str, _Frame] = {}
     for frame in given:
-        photo = photos[frame.path("file_path") or ""]
-        frame = replace(frame, photo=photo, mask=masks.get(frame.path("mask_path") or ""))
+        frame = replace(frame, photo=photos[frame.path("file_path")], mask=masks.get(frame.path("mask_path")))
         if frame.name in frames:
             raise frame.error(f"is of {frame.name}, which an earlier frame is of, too", "remove one of them")
         frames[frame.name] = frame
@@ -290,7 +289,7 @@ def _frames(file: Path, allow_outside: bool) -> tuple[dict[str, Any], dict[str, 
 def _listed(head: Mapping[str, Any], frames: Mapping[str, _Frame]) -> tuple[set[str], set[str]]:
     """Names of the train and test photos that a file lists; an empty set where it lists none of them."""
     names = {str(PurePosixPath(name).with_suffix("")): name for name in frames}
-    names |= {str(frame.path("file_path")): name for name, frame in frames.items()}
+    names |= {frame.path("file_path"): name for name, frame in frames.items()}
     names |= {name: name for name in frames}
 
     def listed(part: str) -> set[str]:
