@@ -2,7 +2,8 @@
 
 Numbers are of many splats, or pixels, at a time; a vector is a triple of them. A *view* is the camera as formulas take
 it: the three rows of its rotation, its translation, both focal lengths in pixels, and for x and y the lowest and the
-highest slope at which a Jacobian is evaluated.
+highest slope at which a Jacobian is evaluated. *Antialiased* is None or not, which is known when a kernel is compiled:
+without anti-aliasing it has no code for it.
 
 Equations: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl et al. 2023, sec. 4).
 """
@@ -19,6 +20,8 @@ TRANSMITTANCE_MIN = F(constants.TRANSMITTANCE_MIN)
 BLUR, BLUR_SQUARED = F(constants.BLUR), F(constants.BLUR**2)
 MIN_SQUARED_NORM = F(conventions.MIN_SQUARED_NORM)
 FINITE = F(constants.FINITE)
+# Square of the smallest factor by which anti-aliasing dims.
+MIN_LIGHT = F(constants.FAINTEST**2)
 HUGE_FOOTPRINT, LARGEST_FOOTPRINT = F(constants.HUGE_FOOTPRINT), F(constants.LARGEST_FOOTPRINT)
 HUGE_QUATERNION, SHRINK = F(constants.HUGE_QUATERNION), F(constants.SHRINK)
 LOG2_ALPHA_MIN = F(math.log2(constants.ALPHA_MIN))
@@ -46,6 +49,12 @@ def dot3(a, b):
 def scale3(k, v):
     """The vector k·v."""
     return k * v[0], k * v[1], k * v[2]
+
+
+@inline
+def add3(v, w):
+    """The vector v + w."""
+    return v[0] + w[0], v[1] + w[1], v[2] + w[2]
 
 
 @inline
@@ -128,10 +137,11 @@ def image_axes(t, m):
 
 
 @inline
-def footprint(view, screen, point, quat, log_scales, logit):
+def footprint(view, screen, point, quat, log_scales, logit, antialiased):
     """Which splats can change the image, their records without the colour, their tiles and radii.
 
-    ``screen`` are principal point, width and height in pixels, and the near plane.
+    ``screen`` are principal point, width and height in pixels, and the near plane. With anti-aliasing, opacities are
+    multiplied by √(det Σ / det(Σ + blur·I)), but for splats so large that the blur does not matter.
     """
     cx, cy, width, height, near = screen
     x, y, z = point
@@ -143,12 +153,16 @@ def footprint(view, screen, point, quat, log_scales, logit):
     size = xx + yy
     unit = simd.where(size > HUGE_FOOTPRINT, 1 / size, 1.0)
     n = scale3(unit, cross(u, v))
-    determinant = dot3(n, n) + simd.fma(BLUR, size, BLUR_SQUARED) * unit * unit
+    area = dot3(n, n)
+    determinant = area + simd.fma(BLUR, size, BLUR_SQUARED) * unit * unit
     xx, yy = xx + BLUR, yy + BLUR
 
     _, _, focal, _, _ = view
     px, py = simd.fma(focal[0], x * inverse, cx), simd.fma(focal[1], y * inverse, cy)
     log2_opacity = -simd.log2(1 + exp2_clamped(-(logit * LOG2_E)))
+    if antialiased is not None:
+        kept = simd.where(size < HUGE_FOOTPRINT, area / determinant, 1.0)
+        log2_opacity = log2_opacity + 0.5 * simd.log2(simd.maximum(kept, MIN_LIGHT))
     # α reaches 1/255 where u² + v² ≤ log2(255 o): a box of half sizes √(2 ln(255 o)·Σ_ii).
     reach = (log2_opacity - LOG2_ALPHA_MIN) * TWO_LN2
     half_x, half_y = simd.sqrt(simd.maximum(reach, 0.0) * xx), simd.sqrt(simd.maximum(reach, 0.0) * yy)
@@ -322,10 +336,28 @@ def axes_backward(view, point, local, axes, gu, gv, centre, g_depth):
 
 
 @inline
-def geometry_backward(view, point, quat, log_scales, factor, moments, centre, g_depth):
+def light_gradient(u, v, h):
+    """Gradients of the rows u and v of U through the factor of anti-aliasing, from that of its logarithm, ``h``.
+
+    With A = det Σ, S the sum of the variances and D = A + b·S + b², the factor is ρ = √(A/D), and
+    d log ρ = ½·((b·S + b²)/(A·D)·dA − b/D·dS), where dA = 2·((v × n)·du + (n × u)·dv) with n = u × v.
+    """
+    n = cross(u, v)
+    area, size = dot3(n, n), dot3(u, u) + dot3(v, v)
+    added = simd.fma(BLUR, size, BLUR_SQUARED)
+    whole = area + added
+    # At the floor, and where the blur does not matter, the factor is constant.
+    free = (size < HUGE_FOOTPRINT) & (area > MIN_LIGHT * whole)
+    by_size = simd.where(free, -(h * BLUR / whole), 0.0)
+    by_n = scale3(simd.where(free, h * added / area / whole, 0.0), n)
+    return fma3(by_size, u, cross(v, by_n)), fma3(by_size, v, cross(by_n, u))
+
+
+@inline
+def geometry_backward(view, point, quat, log_scales, factor, moments, h, centre, g_depth, antialiased):
     """Gradients of mean (without the colour's share), quaternion and log-scales.
 
-    ``factor`` are A, B and C of the record, ``moments`` the sums of h·u², h·u·v and h·v².
+    ``factor`` are A, B and C of the record, ``moments`` the sums of h·u², h·u·v and h·v², ``h`` the sum of h alone.
     """
     local, axes = affine(view, point), axes_of(quat, log_scales)
     _, _, t0, t1 = local
@@ -342,6 +374,10 @@ def geometry_backward(view, point, quat, log_scales, factor, moments, centre, g_
     e, f = fma3(uu, r, scale3(uv, s)), fma3(uv, r, scale3(vv, s))
     gu, gv = scale3(a, e), fma3(b, e, scale3(c, f))
     g_scale = simd.fma(r[0], e[0], s[0] * f[0]), simd.fma(r[1], e[1], s[1] * f[1]), simd.fma(r[2], e[2], s[2] * f[2])
+    if antialiased is not None:
+        light_u, light_v = light_gradient(u, v, h)
+        gu, gv = add3(gu, light_u), add3(gv, light_v)
+        g_scale = add3(g_scale, add3(times3(light_u, u), times3(light_v, v)))
     g_mean, g_quat = axes_backward(view, point, local, axes, gu, gv, centre, g_depth)
     return g_mean, g_quat, g_scale
 

@@ -7,10 +7,9 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.compute.devices import resolve_backend
-from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats.attributes import ATTRIBUTES
-from nsvq_lightning.splats.splats import RawSplats, SplatTensors, check_shapes, sh_degree_of
+from nsvq_lightning.splats.splats import SplatTensors, check_shapes, sh_degree_of
 
 
 class Render(NamedTuple):
@@ -80,8 +79,6 @@ def render(
         raise ValueError(f"background must be one RGB colour of shape [3], got {list(background.shape)}")
     background = background.to(means)
     module = _module_of(backend, means)
-    if antialiased:
-        splats = _compensated(splats, camera, module)
     absgrad = None
     if pixel_weights is not None:
         if tuple(pixel_weights.shape) != (camera.height, camera.width):
@@ -89,23 +86,10 @@ def render(
             raise ValueError(f"pixel_weights must be {expected}, got {list(pixel_weights.shape)}")
         absgrad = means.new_zeros(means.shape[0], 3).requires_grad_()
         pixel_weights = pixel_weights.detach().to(means).contiguous()
-    image, alpha, radii, means2d, depth = module.render(splats, camera, degree, background, pixel_weights, absgrad)
+    image, alpha, radii, means2d, depth = module.render(
+        splats, camera, degree, background, pixel_weights, absgrad, antialiased or None
+    )
     return Render(image, alpha, radii, means2d, depth, absgrad)
-
-
-def _compensated(splats: SplatTensors, camera: Camera, module: Any) -> RawSplats:
-    """The splats with the opacities that keep their light when the rasterizer blurs them by 0.3 square pixels.
-
-    Each opacity in view is multiplied by √(det Σ / det(Σ + 0.3·I)) with Σ the projected covariance before the blur, the
-    factor of Mip-Splatting's 2D filter (Yu et al. 2024): a splat that the blur makes twice as large becomes half as
-    opaque. The factor is differentiable in means, quaternions and scales, and depends on the camera.
-    """
-    with torch.no_grad():
-        rows = module.visible(splats, camera)
-    opacity = take_rows(splats.opacities, rows).sigmoid() * module.light_kept(splats, camera, rows)
-    opacity = opacity.clamp_max(1 - 2.0**-20)  # the rasterizer caps it lower, and its logit is finite
-    seen = splats.opacities.index_copy(0, rows, opacity.log() - (-opacity).log1p())
-    return RawSplats(**{name: getattr(splats, name) for name in ATTRIBUTES} | {"opacities": seen})
 
 
 def _check_alike(splats: SplatTensors) -> None:
@@ -139,7 +123,7 @@ def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> T
 def _module_of(backend: str, like: Tensor) -> Any:
     """The module of a back-end, imported only now because that imports the kernels' compiler.
 
-    It has the functions ``render``, ``visible`` and ``light_kept``; see :mod:`nsvq_lightning.rendering.reference`.
+    It has the functions ``render`` and ``visible``; see :mod:`nsvq_lightning.rendering.reference`.
     """
     name = resolve_backend(backend, like)
     return importlib.import_module(f"{__package__}.{name}{'' if name == 'reference' else '.rasterizer'}")

@@ -123,6 +123,20 @@ def light_kept(splats: SplatTensors, camera: Camera, rows: Tensor) -> Tensor:
     return torch.where(counts, factor, 1.0)
 
 
+def compensated(splats: SplatTensors, camera: Camera) -> RawSplats:
+    """The splats with the opacities that keep their light when the rasterizer blurs them by 0.3 square pixels.
+
+    Each opacity in view is multiplied by √(det Σ / det(Σ + 0.3·I)) with Σ the projected covariance before the blur, the
+    factor of Mip-Splatting's 2D filter (Yu et al. 2024): a splat that the blur makes twice as large becomes half as
+    opaque. The factor is differentiable in means, quaternions and scales, and depends on the camera.
+    """
+    rows = visible(splats, camera)
+    opacity = take_rows(splats.opacities, rows).sigmoid() * light_kept(splats, camera, rows)
+    opacity = opacity.clamp_max(1 - 2.0**-20)  # the rasterizer caps it lower, and its logit is finite
+    seen = splats.opacities.index_copy(0, rows, opacity.log() - (-opacity).log1p())
+    return RawSplats(**{name: getattr(splats, name) for name in ATTRIBUTES} | {"opacities": seen})
+
+
 def render(
     splats: SplatTensors,
     camera: Camera,
@@ -130,11 +144,14 @@ def render(
     background: Tensor,
     pixel_weights: Tensor | None = None,
     absgrad: Tensor | None = None,
+    antialiased: bool | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``, differentiable.
 
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.
     """
+    if antialiased:
+        splats = compensated(splats, camera)
     rows = visible(splats, camera)
     seen = RawSplats(*(getattr(splats, name)[rows] for name in ATTRIBUTES))
     projection = project(seen, camera)

@@ -58,13 +58,18 @@ REGISTERS = {
     "sum_kernel": 48,
 }
 """Most registers that a thread of each kernel may take on sm_90; a multiprocessor has 65 536 for all its threads."""
+ANTIALIASED_REGISTERS = 8
+"""How many more it may take with anti-aliasing."""
 
 
 @pytest.mark.parametrize(
     "cases",
     [
         "radii blend search_45",
-        pytest.param("project_0 project_3 tiles blend_and_observe loss loss_of_one_row", marks=pytest.mark.slow),
+        pytest.param(
+            "project_0 project_3 project_antialiased tiles blend_and_observe loss loss_of_one_row",
+            marks=pytest.mark.slow,
+        ),
         pytest.param("nearest_3 nearest_45 search_3 substitute_3 substitute_45 sums_3 sums_45", marks=pytest.mark.slow),
     ],
 )
@@ -78,7 +83,8 @@ def test_kernels_compile_as_they_are_launched(cases: str) -> None:
     assert built
     for kernel in built:
         assert kernel["stack"] == 0, kernel
-        assert kernel["registers"] <= REGISTERS[kernel["kernel"]], kernel
+        more = ANTIALIASED_REGISTERS if kernel["constants"].get("ANTIALIASED") else 0
+        assert kernel["registers"] <= REGISTERS[kernel["kernel"]] + more, kernel
 
 
 def test_no_kernel_is_left_out() -> None:

@@ -41,7 +41,8 @@ def axes(splats: RawSplats, camera: Camera) -> torch.Tensor:
     return torch.stack([torch.stack(f.image_axes(row, m), 1) for row in rows])
 
 
-def test_splats_lie_where_the_reference_puts_them() -> None:
+@pytest.mark.parametrize("antialiased", [None, True])
+def test_splats_lie_where_the_reference_puts_them(antialiased: bool | None) -> None:
     splats, camera = scene()
     (_, _, z), *expected = reference.image_axes(splats.means, splats.quats, splats.scales, camera)
     torch.testing.assert_close(axes(splats, camera), torch.stack(expected), **CLOSE)
@@ -50,23 +51,27 @@ def test_splats_lie_where_the_reference_puts_them() -> None:
 
     screen = *camera.intrinsics[2:], camera.width, camera.height, camera.near
     shape = splats.quats.unbind(1), splats.scales.unbind(1)
-    seen, record, first, last, radius = f.footprint(view_of(camera), screen, point, *shape, splats.opacities)
+    logits = splats.opacities
+    seen, record, first, last, radius = f.footprint(view_of(camera), screen, point, *shape, logits, antialiased)
+    if antialiased:
+        splats = reference.compensated(splats, camera)
+        assert (splats.opacities < logits).any()
     expected = reference.project(splats, camera)
     x, y, a, b, c, log2_opacity, depth, slope_x, slope_y = record
     torch.testing.assert_close(torch.stack([x, y], 1), expected.means2d, **CLOSE)
     torch.testing.assert_close(depth, expected.depths, **CLOSE)
-    torch.testing.assert_close(log2_opacity.exp2(), splats.opacities.sigmoid(), **CLOSE)
+    rows = reference.visible(splats, camera)
+    torch.testing.assert_close(log2_opacity.exp2()[rows], splats.opacities.sigmoid()[rows], **CLOSE)
     # The factor times itself is the inverse covariance in the binary exponent.
     conics = torch.stack([a * a, a * b, b * b + c * c], 1) * (2 / formulas.LOG2_E)
     torch.testing.assert_close(conics, expected.conics, **CLOSE)
     torch.testing.assert_close(slope_x, -expected.conics[:, 1] / expected.conics[:, 2], **CLOSE)
     torch.testing.assert_close(slope_y, -expected.conics[:, 1] / expected.conics[:, 0], **CLOSE)
-    rows = reference.visible(splats, camera)
     assert torch.equal(seen.nonzero()[:, 0], rows)
     low = ((expected.means2d - expected.half_sizes - 0.5).ceil().clamp_min(0) / formulas.TILE).floor()
     torch.testing.assert_close(torch.stack(first, 1)[rows], low[rows], atol=0, rtol=0)
     assert all(((end - begin)[rows] >= 0).all() for begin, end in zip(first, last, strict=True))
-    assert torch.equal(radius, expected.half_sizes.amax(1).ceil())
+    assert torch.equal(radius[rows], expected.half_sizes.amax(1).ceil()[rows])
 
 
 def test_bands_and_their_gradients() -> None:
@@ -103,9 +108,10 @@ def test_gradient_of_a_quaternion() -> None:
     torch.testing.assert_close(torch.stack(f.quaternion_gradient(unit, inverse, rows), 1), expected, **CLOSE)
 
 
-def test_gradients_of_the_geometry() -> None:
+@pytest.mark.parametrize("antialiased", [None, True])
+def test_gradients_of_the_geometry(antialiased: bool | None) -> None:
     splats, camera = scene()
-    moments, centre, g_depth = random(40, 3), random(40, 2), random(40)
+    moments, h, centre, g_depth = random(40, 3), random(40) + 1, random(40, 2), random(40)
     leaves = [splats.means, splats.quats, splats.scales]
     for leaf in leaves:
         leaf.requires_grad_()
@@ -116,7 +122,7 @@ def test_gradients_of_the_geometry() -> None:
     point = f.view_point(view, splats.means.detach().unbind(1))
     screen = *camera.intrinsics[2:], camera.width, camera.height, camera.near
     shape = splats.quats.detach().unbind(1), splats.scales.detach().unbind(1)
-    _, record, *_ = f.footprint(view, screen, point, *shape, splats.opacities)
+    _, record, *_ = f.footprint(view, screen, point, *shape, splats.opacities, antialiased)
     factor = record[2:5]
     a, b, c = factor
     zero = torch.zeros_like(a)
@@ -125,8 +131,12 @@ def test_gradients_of_the_geometry() -> None:
     g_covariance = F.mT @ S @ F * (formulas.MOMENT_SCALE / 2)
     U = torch.stack([u, v], 1)
     loss = (g_covariance * (U @ U.mT)).sum() + (projected.means2d * centre).sum() + (z * g_depth).sum()
+    if antialiased:
+        loss = loss + (h * reference.light_kept(splats, camera, torch.arange(40)).log()).sum()
     expected = torch.autograd.grad(loss, leaves)
-    found = f.geometry_backward(view, point, *shape, factor, moments.unbind(1), centre.unbind(1), g_depth)
+    found = f.geometry_backward(
+        view, point, *shape, factor, moments.unbind(1), h, centre.unbind(1), g_depth, antialiased
+    )
     for ours, theirs in zip(found, expected, strict=True):
         torch.testing.assert_close(torch.stack(ours, 1), theirs, rtol=1e-4, atol=1e-6)
 

@@ -101,6 +101,23 @@ def test_a_colour_that_is_no_number_shows() -> None:
     assert ours.image[expected.image.isnan()].isnan().all()
 
 
+@pytest.mark.parametrize("log_scale", [-5.0, -2.0])
+def test_anti_aliasing(log_scale: float) -> None:
+    splats, camera = random_splats(24, log_scale=log_scale), front_camera(16, 12)
+    ours, _ = assert_same(splats, camera, antialiased=True)
+    plain = render(on_device(splats), camera, backend="cuda").image.detach().cpu()
+    assert (plain - ours.image).abs().max() > 0.01
+
+
+def test_a_huge_splat_keeps_its_light() -> None:
+    splats, camera = random_splats(4, sh_degree=0, seed=1), front_camera(12, 9)
+    large = splats._replace(scales=splats.scales + math.log(1e12))
+    ours, gradients = run(large, camera, "cuda", torch.float32, antialiased=True)
+    plain, _ = run(large, camera, "cuda", torch.float32)
+    assert torch.equal(ours.image, plain.image)
+    assert all(gradient.isfinite().all() for gradient in gradients.values())
+
+
 def test_more_splats_than_a_program_takes() -> None:
     assert_same(random_splats(129, seed=7, log_scale=-4.0), front_camera(8, 6))
 

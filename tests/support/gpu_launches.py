@@ -52,11 +52,11 @@ def attributes() -> tuple[torch.Tensor, ...]:
     return tuple(tensor(*shape) for shape in shapes)
 
 
-def project(degree: int) -> None:
+def project(degree: int, antialiased: bool | None = None) -> None:
     records, boxes = tensor(SPLATS, RECORD.value), tensor(SPLATS, 4, dtype=torch.int32)
-    projection._launch_projection(lens(), attributes(), degree, records, boxes, tensor(SPLATS, 2))
+    projection._launch_projection(lens(), attributes(), degree, antialiased, records, boxes, tensor(SPLATS, 2))
     ids, rows = tensor(SEEN, dtype=torch.int64), tensor(SEEN, RECORD.value)
-    projection.project_backward(lens(), attributes(), degree, ids, rows, rows, tensor(SPLATS, 2))
+    projection.project_backward(lens(), attributes(), degree, ids, rows, rows, tensor(SPLATS, 2), antialiased)
 
 
 def tiles() -> Tiles:
@@ -100,6 +100,7 @@ CASES: dict[str, Callable[[], object]] = {
     "radii": lambda: projection.project_radii(lens(), attributes()),
     "project_0": lambda: project(0),
     "project_3": lambda: project(3),
+    "project_antialiased": lambda: project(3, antialiased=True),
     "tiles": lambda: tiles_of(tensor(SEEN, 4, dtype=torch.int32), tensor(SEEN, dtype=torch.int32), PAIRS, 7, 4),
     "blend": lambda: render(everything=False),
     "blend_and_observe": lambda: render(everything=True),

@@ -4,24 +4,9 @@ import numpy as np
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel
-from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import color_range
-from nsvq_lightning.rendering.formulas import (
-    BLUR,
-    BLUR_SQUARED,
-    HUGE_FOOTPRINT,
-    affine,
-    axes_of,
-    cross,
-    dot3,
-    footprint,
-    image_axes,
-    view_point,
-)
-
-# Square of the smallest factor by which anti-aliasing dims.
-MIN_LIGHT = F(constants.FAINTEST**2)
+from nsvq_lightning.rendering.formulas import footprint, view_point
 
 
 @inline
@@ -59,7 +44,7 @@ def load_shapes(quats, scales, logits, start, count, scratch):
 
 
 @inline
-def project_range(camera, means, quats, scales, logits, first, last, records, integers, ids, scratch):
+def project_range(camera, antialiased, means, quats, scales, logits, first, last, records, integers, ids, scratch):
     """Write the records of a range's visible splats; returns how many there are and how many slots they need."""
     zero = simd.broadcast(0)
     visible = 0
@@ -73,7 +58,7 @@ def project_range(camera, means, quats, scales, logits, first, last, records, in
         if simd.mask_bits(point[2] > simd.load_one(camera, rec.NEAR)) & lanes == 0:
             continue
         quat, scale, logit = load_shapes(quats, scales, logits, start, count, scratch)
-        seen, record, corner, end, radius = footprint(view, load_screen(camera), point, quat, scale, logit)
+        seen, record, corner, end, radius = footprint(view, load_screen(camera), point, quat, scale, logit, antialiased)
         bits = simd.mask_bits(seen) & lanes
         if bits == 0:
             continue
@@ -106,12 +91,12 @@ def project_range(camera, means, quats, scales, logits, first, last, records, in
 
 @parallel
 def project_splats(
-    thread, threads, camera, means, quats, scales, logits, records, integers, found, counts, slots, scratch
+    thread, threads, camera, antialiased, means, quats, scales, logits, records, integers, found, counts, slots, scratch
 ):
     """Write the records of all visible splats; ``found`` gets a run of rows for each thread's range."""
     first, last = rec.vector_range(logits.shape[0], thread, threads)
     counts[thread], slots[thread] = project_range(
-        camera, means, quats, scales, logits, first, last, records, integers, found, scratch[thread]
+        camera, antialiased, means, quats, scales, logits, first, last, records, integers, found, scratch[thread]
     )
 
 
@@ -156,25 +141,3 @@ def add_colors(thread, threads, camera, means, colors, bands, ids, count, record
     """
     first, last = rec.vector_range(count, thread, threads)
     color_range(camera, means, colors, bands, ids, first, last, records, scratch[thread])
-
-
-@inline
-def light(u, v):
-    """The light that the blur leaves, squared; det Σ, the sum of the variances, what the blur adds to det Σ, u × v."""
-    n = cross(u, v)
-    area, size = dot3(n, n), dot3(u, u) + dot3(v, v)
-    added = BLUR * size + BLUR_SQUARED
-    squared = simd.where(size < HUGE_FOOTPRINT, area / (area + added), 1)
-    return simd.maximum(squared, MIN_LIGHT), area, size, added, n
-
-
-@parallel
-def keep_light(thread, threads, camera, means, quats, scales, ids, count, factors):
-    """Factors ``[count]`` of the splats ``ids``; both arrays have room for a last, incomplete vector."""
-    first, last = rec.vector_range(count, thread, threads)
-    for start in range(first, last, 16):
-        view = rec.load_view(camera)
-        _, _, t0, t1 = affine(view, view_point(view, simd.gather_rows3(means, ids, start)))
-        _, _, _, m = axes_of(simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start))
-        squared, _, _, _, _ = light(image_axes(t0, m), image_axes(t1, m))
-        simd.store(factors, start, simd.sqrt(squared))

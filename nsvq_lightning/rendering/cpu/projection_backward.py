@@ -1,4 +1,4 @@
-"""The backward passes of the projection and of anti-aliasing, 16 splats at a time, to gradients of the attributes."""
+"""The backward pass of the projection, 16 splats at a time, to gradients of the attributes."""
 
 import numpy as np
 
@@ -8,8 +8,6 @@ from nsvq_lightning.compute.rows import clear
 from nsvq_lightning.rendering import formulas
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import AHEAD, coefficients_of, color_backward, prefetch_sh
-from nsvq_lightning.rendering.cpu.projection import MIN_LIGHT, light
-from nsvq_lightning.rendering.formulas import cross, image_axes, view_point
 
 
 @inline
@@ -26,8 +24,9 @@ def clear_rows(first, last, stride, gradients):
 
 @parallel
 def project_backward(
-    thread, threads, camera, geometry, shN, bands, ids, count, records, integers, sums, g_means2d, gradients, scratch
-):
+    thread, threads, camera, antialiased, geometry, shN, bands, ids, count, records, integers, sums, g_means2d,
+    gradients, scratch,
+):  # fmt: skip
     """Gradients of all raw attributes from the sums of the slots of the visible splats; 0 for the others.
 
     ``sums[16·slot]`` of a splat's first slot holds its total; ``g_means2d [N·2]`` the gradient of its projected centre.
@@ -69,8 +68,9 @@ def project_backward(
         factor = record[rec.A], record[rec.B], record[rec.C]
         moments = total[rec.SUM_UU], total[rec.SUM_UV], total[rec.SUM_VV]
         g_mean, g_quat, g_scale = formulas.geometry_backward(
-            view, view_point(view, mean), quat, scale, factor, moments, (g2x, g2y), total[rec.SUM_DEPTH]
-        )
+            view, formulas.view_point(view, mean), quat, scale, factor, moments, total[rec.SUM_H], (g2x, g2y),
+            total[rec.SUM_DEPTH], antialiased,
+        )  # fmt: skip
         colors = record[rec.RED], record[rec.GREEN], record[rec.BLUE]
         rgb = formulas.unclamped(colors, (total[rec.SUM_RED], total[rec.SUM_GREEN], total[rec.SUM_BLUE]))
         gx, gy, gz = color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, work)
@@ -79,41 +79,3 @@ def project_backward(
         simd.scatter_rows3(g_scales, ids, start, g_scale)
         logit = simd.gather_rows1(logits, ids, start)[0]
         simd.scatter_rows1(g_logits, ids, start, (formulas.logit_gradient(logit, total[rec.SUM_H]),))
-
-
-@parallel
-def keep_light_backward(
-    thread, threads, camera, means, quats, scales, ids, count, gradient, g_means, g_quats, g_scales
-):
-    """Gradients of the rows ``ids`` of all means, quaternions and log-scales from that of their factors ``[count]``.
-
-    With A = det Σ, S the sum of the variances and D = A + b·S + b², the factor is ρ = √(A/D), and
-    dρ = ½·ρ·((b·S + b²)/(A·D)·dA − b/D·dS), where dA = 2·((v × n)·du + (n × u)·dv) with n = u × v.
-    """
-    first, last = rec.vector_range(count, thread, threads)
-    for start in range(first, last, 16):
-        view = rec.load_view(camera)
-        point = view_point(view, simd.gather_rows3(means, ids, start))
-        local = formulas.affine(view, point)
-        axes = formulas.axes_of(simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start))
-        _, _, t0, t1 = local
-        _, _, _, m = axes
-        u, v = image_axes(t0, m), image_axes(t1, m)
-        squared, area, size, added, n = light(u, v)
-        # At the floor, and where the blur does not count, the factor is constant.
-        free = (size < formulas.HUGE_FOOTPRINT) & (squared > MIN_LIGHT)
-        # A huge splat's v × n would overflow, and 0 · ∞ is not 0.
-        u = simd.where(free, u[0], 0), simd.where(free, u[1], 0), simd.where(free, u[2], 0)
-        v = simd.where(free, v[0], 0), simd.where(free, v[1], 0), simd.where(free, v[2], 0)
-        whole = area + added
-        g = simd.where(free, simd.load(gradient, start) * simd.sqrt(squared) / whole, 0)
-        by_area = simd.where(free, g * added / area, 0)
-        by_size = g * formulas.BLUR
-        vn, nu = cross(v, n), cross(n, u)
-        gu = by_area * vn[0] - by_size * u[0], by_area * vn[1] - by_size * u[1], by_area * vn[2] - by_size * u[2]
-        gv = by_area * nu[0] - by_size * v[0], by_area * nu[1] - by_size * v[1], by_area * nu[2] - by_size * v[2]
-        g_mean, g_quat = formulas.axes_backward(view, point, local, axes, gu, gv, (0, 0), 0)
-        simd.scatter_rows3(g_means, ids, start, g_mean)
-        simd.scatter_rows4(g_quats, ids, start, g_quat)
-        g_scale = gu[0] * u[0] + gv[0] * v[0], gu[1] * u[1] + gv[1] * v[1], gu[2] * u[2] + gv[2] * v[2]
-        simd.scatter_rows3(g_scales, ids, start, g_scale)

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.jit import thread_count
-from nsvq_lightning.compute.memory import Array, Workspace, flat, flat_checked, outside, recycled
+from nsvq_lightning.compute.memory import Array, Workspace, flat, flat_checked, recycled
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import binning, projection, projection_backward
 from nsvq_lightning.rendering.cpu import blend as blending
@@ -18,11 +18,11 @@ from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import SplatTensors
 
 
-def _flat(attributes: tuple[Tensor, ...]) -> tuple[Array, ...]:
-    """Means, rotations, scales and, if it is there, opacities, flat."""
-    n = len(attributes[0])
-    named = zip(ATTRIBUTES, attributes, ((n, 3), (n, 4), (n, 3), (n,)), strict=False)
-    return tuple(flat_checked(name, tensor.contiguous(), shape) for name, tensor, shape in named)
+def _geometry(splats: SplatTensors) -> tuple[Array, ...]:
+    """Means, rotations, scales and opacities, flat."""
+    n = len(splats.means)
+    shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+    return tuple(flat_checked(name, getattr(splats, name).contiguous(), shape) for name, shape in shapes.items())
 
 
 PROJECTION_SCRATCH = 2048 + 64
@@ -31,13 +31,14 @@ PROJECTION_SCRATCH = 2048 + 64
 class _Frame:
     """One view of the splats on its way through the stages; holds its workspace for as long as it lives."""
 
-    def __init__(self, splats: SplatTensors, camera: Camera) -> None:
+    def __init__(self, splats: SplatTensors, camera: Camera, antialiased: bool | None = None) -> None:
         self.camera = rec.pack_camera(camera)
+        self.antialiased = antialiased
         self.size = width, height = camera.width, camera.height
         self.group_columns, group_rows = rec.group_grid(width, height)
         self.tiles = self.group_columns * group_rows * rec.GROUP_TILES
         self.n = splats.means.shape[0]
-        self.geometry = _flat((splats.means, splats.quats, splats.scales, splats.opacities))
+        self.geometry = _geometry(splats)
         self.threads = thread_count()
         self.work = Workspace.borrow()
         self.records = self.work.array("records", rec.RECORD * self.n)
@@ -55,8 +56,9 @@ class _Frame:
         found = self.work.array("found", self.n, np.int32)
         counts, slots = (self.work.array(name, self.threads, np.int64) for name in ("counts", "slot_counts"))
         projection.project_splats(
-            self.threads, self.camera, *self.geometry, self.records, self.integers, found, counts, slots, self.scratch
-        )
+            self.threads, self.camera, self.antialiased, *self.geometry, self.records, self.integers, found, counts,
+            slots, self.scratch,
+        )  # fmt: skip
         return found, counts, slots
 
     def project(self, colors: tuple[Array, Array], bands: tuple[int, int], means2d: Array, radii: Array) -> None:
@@ -149,9 +151,9 @@ class _Project(torch.autograd.Function):
         _check_kept(ctx.saved_tensors, ctx.shapes)
         gradients = [recycled(shape) for shape in ctx.shapes]
         projection_backward.project_backward(
-            frame.threads, frame.camera, frame.geometry, _colors(frame.n, sh0, shN)[1], ctx.bands, frame.ids,
-            frame.count, frame.records, frame.integers, frame.sums, flat(g_means2d), tuple(map(flat, gradients)),
-            frame.scratch,
+            frame.threads, frame.camera, frame.antialiased, frame.geometry, _colors(frame.n, sh0, shN)[1], ctx.bands,
+            frame.ids, frame.count, frame.records, frame.integers, frame.sums, flat(g_means2d),
+            tuple(map(flat, gradients)), frame.scratch,
         )  # fmt: skip
         return None, None, *gradients
 
@@ -213,6 +215,7 @@ def render(
     background: Tensor,
     pixel_weights: Tensor | None = None,
     absgrad: Tensor | None = None,
+    antialiased: bool | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
@@ -223,7 +226,7 @@ def render(
         TypeError: An attribute is not float32.
     """
     attributes = splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN
-    frame = _Frame(splats, camera)
+    frame = _Frame(splats, camera, antialiased)
     means2d, token, radii = _Project.apply(frame, sh_degree, *attributes)
     image, alpha, depth = _Blend.apply(frame, means2d, token, background, pixel_weights, absgrad)
     return image, alpha, radii, means2d, depth
@@ -241,47 +244,3 @@ def visible(splats: SplatTensors, camera: Camera) -> Tensor:
     starts = (rec.vector_range.py_func(frame.n, thread, frame.threads)[0] for thread in range(frame.threads))
     runs = [found[start : start + count] for start, count in zip(starts, counts, strict=True)]
     return torch.from_numpy(np.concatenate(runs, dtype=np.int64))
-
-
-class _LightKept(torch.autograd.Function):
-    """Means, rotations and scales to what anti-aliasing leaves of the light of some splats."""
-
-    @staticmethod
-    def forward(ctx: Any, camera: Array, ids: Array, count: int, *attributes: Tensor) -> Tensor:
-        factors = torch.empty(len(ids))
-        projection.keep_light(thread_count(), camera, *_flat(attributes), ids, count, flat(factors))
-        ctx.camera, ctx.ids, ctx.count = camera, ids, count
-        ctx.save_for_backward(*attributes)
-        return factors[:count]
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        attributes = ctx.saved_tensors
-        gradients = [torch.zeros(tensor.shape) for tensor in attributes]
-        given = torch.zeros(len(ctx.ids))
-        given[: ctx.count], given[ctx.count :] = grad, grad[-1]
-        projection_backward.keep_light_backward(
-            thread_count(), ctx.camera, *_flat(attributes), ctx.ids, ctx.count, flat(given), *map(flat, gradients)
-        )
-        return None, None, None, *gradients
-
-
-def light_kept(splats: SplatTensors, camera: Camera, rows: Tensor) -> Tensor:
-    """Factors ``[V]`` of the splats ``rows [V]`` int64, differentiable in means, quaternions and log-scales.
-
-    Raises:
-        ValueError: The attributes do not fit together, or a row is outside them.
-        TypeError: An attribute is not float32.
-    """
-    count = len(rows)
-    if count == 0:
-        return splats.means.new_zeros(0)
-    numbers = rows.detach().numpy()
-    if int(numbers.min()) < 0 or int(numbers.max()) >= len(splats.means):
-        raise outside("rows", numbers, len(splats.means))
-    # A last, incomplete vector repeats the last splat; each of its lanes computes and writes the same.
-    ids = np.full(16 * ((count + 15) // 16), numbers[-1], np.int32)
-    ids[:count] = numbers
-    factors: Tensor = _LightKept.apply(rec.pack_camera(camera), ids, count, splats.means, splats.quats, splats.scales)
-    return factors

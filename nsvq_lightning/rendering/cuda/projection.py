@@ -55,7 +55,7 @@ RADIUS_ONLY = -1
 @triton.jit(do_not_specialize=["n"])
 def project_kernel(
     means, quats, scales, logits, sh0, shN, view, fx, fy, cx, cy, width, height, n, stride,
-    records, boxes, means2d, radii, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
+    records, boxes, means2d, radii, DEGREE: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Records, tile boxes and centres of the splats in view at their own rows; radii, 0 for the rest."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -65,7 +65,7 @@ def project_kernel(
     camera = load_view(view, fx, fy)
     screen = (cx, cy, width, height, tl.load(view + NEAR))
     point = formulas.view_point(camera, mean)
-    seen, record, first, last, radius = formulas.footprint(camera, screen, point, quat, scale, logit)
+    seen, record, first, last, radius = formulas.footprint(camera, screen, point, quat, scale, logit, ANTIALIASED)
     seen = inside & seen
     radius = tl.minimum(radius, 1e9)
     tl.store(radii + row, tl.where(seen, radius, 0.0).to(tl.int32), mask=inside)
@@ -95,7 +95,7 @@ def project_kernel(
 def project_backward_kernel(
     means, quats, scales, logits, shN, view, fx, fy, cx, cy, width, height, n, ranks, records, totals, g_means2d,
     g_means, g_quats, g_scales, g_logits, g_sh0, g_shN,
-    STRIDE: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
+    STRIDE: tl.constexpr, DEGREE: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Gradients of all attributes from the moments (``totals``, one slot each) of the splats in view.
 
@@ -111,9 +111,11 @@ def project_backward_kernel(
     total, record = totals + rank * rec.RECORD, records + rank * rec.RECORD
     g2x = tl.load(g_means2d + 2 * row, mask=seen, other=0.0)
     g2y = tl.load(g_means2d + 2 * row + 1, mask=seen, other=0.0)
+    h = tl.load(total + rec.SUM_H, mask=seen, other=0.0)
     g_mean, g_quat, g_scale = formulas.geometry_backward(
         camera, (x, y, tl.where(seen, z, 1.0)), quat, scale, load3(record + rec.A, seen),
-        load3(total + rec.SUM_UU, seen), (g2x, g2y), tl.load(total + rec.SUM_DEPTH, mask=seen, other=0.0),
+        load3(total + rec.SUM_UU, seen), h, (g2x, g2y), tl.load(total + rec.SUM_DEPTH, mask=seen, other=0.0),
+        ANTIALIASED,
     )  # fmt: skip
     store3(g_scales + 3 * row, g_scale[0], g_scale[1], g_scale[2], inside)
     tl.store(g_quats + 4 * row, g_quat[0], mask=inside)
@@ -127,7 +129,6 @@ def project_backward_kernel(
     g = formulas.mean_gradient(d, d_inverse, g)
     store3(g_means + 3 * row, g_mean[0] + g[0], g_mean[1] + g[1], g_mean[2] + g[2], inside)
     logit = tl.load(logits + row, mask=seen, other=0.0)
-    h = tl.load(total + rec.SUM_H, mask=seen, other=0.0)
     tl.store(g_logits + row, formulas.logit_gradient(logit, h), mask=inside)
 
 
@@ -196,7 +197,13 @@ def _check_attributes(lens: Lens, attributes: tuple[Tensor, ...]) -> None:
 
 
 def _launch_projection(
-    lens: Lens, attributes: tuple[Tensor, ...], degree: int, records: Tensor, boxes: Tensor, means2d: Tensor
+    lens: Lens,
+    attributes: tuple[Tensor, ...],
+    degree: int,
+    antialiased: bool | None,
+    records: Tensor,
+    boxes: Tensor,
+    means2d: Tensor,
 ) -> Tensor:
     n, shN = attributes[0].shape[0], attributes[-1]
     _check_attributes(lens, attributes)
@@ -204,7 +211,7 @@ def _launch_projection(
     if n:
         project_kernel[(triton.cdiv(n, BLOCK),)](
             *attributes, *lens, n, 3 * shN.shape[1], records, boxes, means2d, radii,
-            DEGREE=degree, BLOCK=BLOCK, **COMPILE,
+            DEGREE=degree, ANTIALIASED=antialiased, BLOCK=BLOCK, **COMPILE,
         )  # fmt: skip
     return radii
 
@@ -217,16 +224,17 @@ def project_radii(lens: Lens, attributes: tuple[Tensor, ...]) -> Tensor:
         TypeError: A dtype is wrong.
     """
     unused = attributes[0]
-    return _launch_projection(lens, attributes, RADIUS_ONLY, unused, unused, unused)
+    return _launch_projection(lens, attributes, RADIUS_ONLY, None, unused, unused, unused)
 
 
-def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int) -> Projected:
+def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int, antialiased: bool | None = None) -> Projected:
     """Project all splats and list those in view.
 
     Args:
         lens: The camera.
         attributes: The six raw attributes, contiguous float32, in the order of :class:`~nsvq_lightning.RawSplats`.
         degree: Highest SH degree that is evaluated, at most the stored one.
+        antialiased: Whether with anti-aliasing; None for not.
 
     Raises:
         ValueError: The tensors do not fit together.
@@ -237,7 +245,7 @@ def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int) -> Projecte
     records = means.new_empty(n, rec.RECORD.value)
     boxes = torch.empty(n, 4, dtype=torch.int32, device=means.device)
     means2d = means.new_zeros(n, 2)
-    radii = _launch_projection(lens, attributes, degree, records, boxes, means2d)
+    radii = _launch_projection(lens, attributes, degree, antialiased, records, boxes, means2d)
     ids = radii.nonzero()[:, 0]
     ids = ids[records[ids, rec.DEPTH.value].sort(stable=True).indices]
     return Projected(means2d, radii, ids, records[ids], boxes[ids])
@@ -251,6 +259,7 @@ def project_backward(
     records: Tensor,
     totals: Tensor,
     g_means2d: Tensor,
+    antialiased: bool | None = None,
 ) -> list[Tensor]:
     """Gradients of the six attributes, 0 for splats not in view.
 
@@ -262,6 +271,7 @@ def project_backward(
         records: Their records ``[V, RECORD]``.
         totals: Their summed moments ``[V, RECORD]``.
         g_means2d: Gradient of the projected centres ``[N, 2]``.
+        antialiased: As in :func:`project`.
 
     Raises:
         ValueError: The tensors do not fit together.
@@ -281,6 +291,6 @@ def project_backward(
     if n:
         project_backward_kernel[(triton.cdiv(n, BLOCK),)](
             means, quats, scales, logits, shN, *lens, n, ranks, records, totals, g_means2d, *gradients,
-            STRIDE=3 * shN.shape[1], DEGREE=degree, BLOCK=BLOCK, **COMPILE,
+            STRIDE=3 * shN.shape[1], DEGREE=degree, ANTIALIASED=antialiased, BLOCK=BLOCK, **COMPILE,
         )  # fmt: skip
     return gradients

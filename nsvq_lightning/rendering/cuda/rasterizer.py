@@ -10,7 +10,6 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.binning import Tiles, list_tiles
 from nsvq_lightning.rendering.cuda.blend import blend, blend_backward, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens, project, project_backward, project_radii
-from nsvq_lightning.rendering.reference import light_kept as light_kept
 from nsvq_lightning.splats.splats import SplatTensors
 
 
@@ -24,9 +23,9 @@ class _Project(torch.autograd.Function):
     """Raw attributes to centres, radii and records; the gradient of a record is its moments, see ``records``."""
 
     @staticmethod
-    def forward(ctx: Any, lens: Lens, degree: int, *attributes: Tensor) -> tuple[Tensor, ...]:
-        projected = project(lens, attributes, degree)
-        ctx.lens, ctx.degree = lens, degree
+    def forward(ctx: Any, lens: Lens, degree: int, antialiased: bool | None, *attributes: Tensor) -> tuple[Tensor, ...]:
+        projected = project(lens, attributes, degree, antialiased)
+        ctx.lens, ctx.degree, ctx.antialiased = lens, degree, antialiased
         ctx.save_for_backward(projected.ids, projected.records, *attributes)
         ctx.mark_non_differentiable(projected.radii, projected.ids, projected.boxes)
         ctx.set_materialize_grads(False)
@@ -38,8 +37,10 @@ class _Project(torch.autograd.Function):
         ids, records, *attributes = ctx.saved_tensors
         moments = torch.zeros_like(records) if moments is None else moments.contiguous()
         g_means2d = records.new_zeros(len(attributes[0]), 2) if g_means2d is None else g_means2d.contiguous()
-        gradients = project_backward(ctx.lens, tuple(attributes), ctx.degree, ids, records, moments, g_means2d)
-        return None, None, *gradients
+        gradients = project_backward(
+            ctx.lens, tuple(attributes), ctx.degree, ids, records, moments, g_means2d, ctx.antialiased
+        )
+        return None, None, None, *gradients
 
 
 class _Blend(torch.autograd.Function):
@@ -77,6 +78,7 @@ def render(
     background: Tensor,
     pixel_weights: Tensor | None = None,
     absgrad: Tensor | None = None,
+    antialiased: bool | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
@@ -85,7 +87,7 @@ def render(
     attributes = _attributes(splats)
     with torch.cuda.device_of(attributes[0]):
         lens = Lens.of(camera, attributes[0].device)
-        means2d, radii, ids, records, boxes = _Project.apply(lens, sh_degree, *attributes)
+        means2d, radii, ids, records, boxes = _Project.apply(lens, sh_degree, antialiased, *attributes)
         image, alpha, depth = _Blend.apply(lens, means2d, ids, records, boxes, background, pixel_weights, absgrad)
     return image, alpha, radii, means2d, depth
 
