@@ -82,12 +82,23 @@ def exp2_clamped(x):
 
 
 @inline
+def times(m, v):
+    """The product of a matrix, three rows, and a vector."""
+    return dot3(m[0], v), dot3(m[1], v), dot3(m[2], v)
+
+
+@inline
+def columns(m):
+    """The columns of a matrix, which are the rows of its transpose."""
+    r0, r1, r2 = m
+    return (r0[0], r1[0], r2[0]), (r0[1], r1[1], r2[1]), (r0[2], r1[2], r2[2])
+
+
+@inline
 def view_point(view, mean):
     """View-space x, y, z."""
     rotation, translation, _, _, _ = view
-    x = dot3(rotation[0], mean) + translation[0]
-    y = dot3(rotation[1], mean) + translation[1]
-    return x, y, dot3(rotation[2], mean) + translation[2]
+    return add3(times(rotation, mean), translation)
 
 
 @inline
@@ -132,8 +143,7 @@ def axes_of(quat, log_scales):
 @inline
 def image_axes(t, m):
     """One row of U = T·M: the splat's axes along one image axis."""
-    m0, m1, m2 = m
-    return dot3(t, (m0[0], m1[0], m2[0])), dot3(t, (m0[1], m1[1], m2[1])), dot3(t, (m0[2], m1[2], m2[2]))
+    return times(columns(m), t)
 
 
 @inline
@@ -304,7 +314,6 @@ def axes_backward(view, point, local, axes, gu, gv, centre, g_depth):
     projected centre, ``g_depth`` that of the depth.
     """
     rotation, _, focal, _, _ = view
-    w0, w1, w2 = rotation
     x, y, _ = point
     inverse, slopes, t0, t1 = local
     slope_x, slope_y = slopes
@@ -315,11 +324,10 @@ def axes_backward(view, point, local, axes, gu, gv, centre, g_depth):
     g_rotation = times3(gm0, lengths), times3(gm1, lengths), times3(gm2, lengths)
     g_quat = quaternion_gradient(q, q_inverse, g_rotation)
 
-    g0 = dot3(gu, m[0]), dot3(gu, m[1]), dot3(gu, m[2])
-    g1 = dot3(gv, m[0]), dot3(gv, m[1]), dot3(gv, m[2])
+    g0, g1 = times(m, gu), times(m, gv)
     # J = [[fx/z, 0, -fx·sx/z], [0, fy/z, -fy·sy/z]]; sx = x/z except where it is clamped.
-    j00, j02 = dot3(w0, g0), dot3(w2, g0)
-    j11, j12 = dot3(w1, g1), dot3(w2, g1)
+    j00, _, j02 = times(rotation, g0)
+    _, j11, j12 = times(rotation, g1)
     g2x, g2y = centre
     fx, fy = focal[0] * inverse, focal[1] * inverse
     fx_z, fy_z = fx * inverse, fy * inverse
@@ -330,9 +338,7 @@ def axes_backward(view, point, local, axes, gu, gv, centre, g_depth):
     vy = simd.fma(-(free_y * fy_z), j12, fy * g2y)
     vz = (1 + free_x) * fx_z * slope_x * j02 + (1 + free_y) * fy_z * slope_y * j12
     vz = vz - fx_z * (x * g2x + j00) - fy_z * (y * g2y + j11)
-    v = vx, vy, vz + g_depth
-    c0, c1, c2 = (w0[0], w1[0], w2[0]), (w0[1], w1[1], w2[1]), (w0[2], w1[2], w2[2])
-    return (dot3(c0, v), dot3(c1, v), dot3(c2, v)), g_quat
+    return times(columns(rotation), (vx, vy, vz + g_depth)), g_quat
 
 
 @inline
@@ -391,14 +397,20 @@ def exponent(a, b, c, u0, v0, peak, x, y):
 
 
 @inline
+def alpha_of(power):
+    """α before the cap, and α, 0 below 1/255, where log2 α before the cap is ``power``."""
+    raw = simd.exp2(power)
+    return raw, simd.where(power >= LOG2_ALPHA_MIN, simd.minimum(raw, ALPHA_MAX), 0.0)
+
+
+@inline
 def blend_step(power, t):
     """What a splat does to pixels with transmittance ``t`` where log2 α before the cap is ``power``.
 
     Returns α before the cap, α, 0 below 1/255, the transmittance after it, whether that leaves the pixel open, and the
     weight of the splat's colour.
     """
-    raw = simd.exp2(power)
-    alpha = simd.where(power >= LOG2_ALPHA_MIN, simd.minimum(raw, ALPHA_MAX), 0.0)
+    raw, alpha = alpha_of(power)
     after = simd.fma(-alpha, t, t)
     is_open = after >= TRANSMITTANCE_MIN
     return raw, alpha, after, is_open, simd.where(is_open, alpha * t, 0.0)

@@ -4,7 +4,7 @@ import numpy as np
 
 from nsvq_lightning.compute.jit import in_parallel, inline, kernel, parallel
 from nsvq_lightning.compute.simd import get, prefetch, put
-from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES
+from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES, share
 
 DIGIT_BITS = 11
 DIGITS = 1 << DIGIT_BITS
@@ -14,7 +14,8 @@ DIGITS = 1 << DIGIT_BITS
 def _count_digits(thread, threads, count, source, low, shift, histogram):
     row = histogram[thread]
     row[:] = 0
-    for i in range(count * thread // threads, count * (thread + 1) // threads):
+    first, end = share(count, thread, threads)
+    for i in range(first, end):
         row[((np.int64(get(source, i)) - low) >> shift) & (DIGITS - 1)] += 1
 
 
@@ -22,7 +23,8 @@ def _count_digits(thread, threads, count, source, low, shift, histogram):
 def _move(thread, threads, count, source, from_ids, target, to_ids, low, shift, histogram):
     """Move keys and what belongs to them to where their digits belong."""
     row = histogram[thread]
-    for i in range(count * thread // threads, count * (thread + 1) // threads):
+    first, end = share(count, thread, threads)
+    for i in range(first, end):
         key = get(source, i)
         digit = ((np.int64(key) - low) >> shift) & (DIGITS - 1)
         place = row[digit]
@@ -82,9 +84,9 @@ AHEAD = 16
 def _count_tiles(thread, threads, count, order, boxes, group_columns, histogram):
     row = histogram[thread]
     row[:] = 0
-    last = count * (thread + 1) // threads
-    for i in range(count * thread // threads, last):
-        if i + AHEAD < last:
+    first, end = share(count, thread, threads)
+    for i in range(first, end):
+        if i + AHEAD < end:
             prefetch(boxes, np.int64(get(order, i + AHEAD)))
         x0, y0, x1, y1 = tile_range(boxes, np.int64(get(order, i)))
         for y in range(y0, y1):
@@ -118,9 +120,9 @@ def count_tiles(threads, count, order, boxes, group_columns, histogram, offsets)
 def fill_tiles(thread, threads, count, order, boxes, group_columns, histogram, ids, entries):
     """Write the row of every splat (``ids``, by place) into the lists of its tiles, keeping the order."""
     row = histogram[thread]
-    last = count * (thread + 1) // threads
-    for i in range(count * thread // threads, last):
-        if i + AHEAD < last:
+    first, end = share(count, thread, threads)
+    for i in range(first, end):
+        if i + AHEAD < end:
             prefetch(boxes, np.int64(get(order, i + AHEAD)))
             prefetch(ids, np.int64(get(order, i + AHEAD)))
         place = np.int64(get(order, i))

@@ -20,9 +20,11 @@ from nsvq_lightning.rendering.formulas import (
     TILE,
     TRANSMITTANCE_MIN,
     TWO_LN2,
+    alpha_of,
     blend_step,
     dot3,
     exponent,
+    fma3,
 )
 
 BATCH = 128
@@ -49,15 +51,33 @@ BACKWARD_SCRATCH = BLOCKS * BLOCK_STATE
 
 
 @inline
-def offsets_at(a, b, c, x, y):
-    """Constant terms of the factors u = A·x + B·y + u0 and v = C·y + v0 of the exponent of a splat at (x, y)."""
-    return -(a * x + b * y), -(c * y)
+def pixels_of(grid, block):
+    """Pixel centres of a block, x and y."""
+    return simd.load(grid, 16 * block), simd.load(grid, 256 + 16 * block)
+
+
+@inline
+def block_corner(block, corner):
+    """Left and top pixel of a block of the tile at ``corner``."""
+    return corner[0] + (block & 3) * BLOCK_SIDE, corner[1] + (block >> 2) * BLOCK_SIDE
+
+
+@inline
+def in_tile(records, r, corner):
+    """Centre of a splat in a tile, and A, B and C of its record with u0 and v0.
+
+    The factors of its exponent are u = A·x + B·y + u0 and v = C·y + v0.
+    """
+    a, b, c = rec.get3(records, r + rec.A)
+    x, y = simd.get(records, r + rec.X) - F(corner[0]), simd.get(records, r + rec.Y) - F(corner[1])
+    return x, y, (a, b, c, -(a * x + b * y), -(c * y))
 
 
 @inline
 def highest_exponent(a, b, c, slope_x, slope_y, left, right, top, bottom):
     """Largest value of -(u² + v²) on rectangles relative to the splat's centre: it lies on the edges facing it."""
-    dx, dy = simd.maximum(left, simd.minimum(right, 0)), simd.maximum(top, simd.minimum(bottom, 0))
+    dx = simd.maximum(left, simd.minimum(right, 0))
+    dy = simd.maximum(top, simd.minimum(bottom, 0))
     along_y = simd.maximum(top, simd.minimum(bottom, slope_x * dx))
     along_x = simd.maximum(left, simd.minimum(right, slope_y * dy))
     first, _, _ = exponent(a, b, c, 0, 0, 0, dx, along_y)
@@ -73,10 +93,12 @@ REACH_MARGIN = F(2.0**-8)
 @inline
 def reachable_blocks(batch, o, x, y, grid):
     """Mask of the blocks of a tile in which a splat can reach α = 1/255."""
-    left, top = simd.load(grid, 512) - x, simd.load(grid, 528) - y
+    left = simd.load(grid, 512) - x
+    top = simd.load(grid, 528) - y
     side = F(BLOCK_SIDE - 1)
-    a, b, c = rec.load3(batch, o + rec.A, 1)
-    slope_x, slope_y = simd.load_one(batch, o + rec.SLOPE_X), simd.load_one(batch, o + rec.SLOPE_Y)
+    a, b, c = rec.load3(batch, o + rec.A)
+    slope_x = simd.load_one(batch, o + rec.SLOPE_X)
+    slope_y = simd.load_one(batch, o + rec.SLOPE_Y)
     peak = highest_exponent(a, b, c, slope_x, slope_y, left, left + side, top, top + side)
     return simd.mask_bits(peak >= LOG2_ALPHA_MIN - REACH_MARGIN - simd.get(batch, o + rec.LOG2_OPACITY))
 
@@ -84,22 +106,12 @@ def reachable_blocks(batch, o, x, y, grid):
 @inline
 def alpha_at(batch, r, x, y):
     """α of one splat of a batch on a block of pixels, 0 below 1/255; a batch holds (u0, v0) in place of the centre."""
-    a, b, c = rec.load3(batch, r + rec.A, 1)
-    u0, v0 = simd.load_one(batch, r + rec.X), simd.load_one(batch, r + rec.Y)
+    a, b, c = rec.load3(batch, r + rec.A)
+    u0 = simd.load_one(batch, r + rec.X)
+    v0 = simd.load_one(batch, r + rec.Y)
     power, _, _ = exponent(a, b, c, u0, v0, simd.load_one(batch, r + rec.LOG2_OPACITY), x, y)
-    return simd.where(power >= LOG2_ALPHA_MIN, simd.minimum(simd.exp2(power), ALPHA_MAX), 0)
-
-
-@inline
-def accumulate(batch, r, weight, sums):
-    """Add colour and depth of one splat."""
-    red, green, blue, depth = sums
-    return (
-        simd.fma(weight, simd.load_one(batch, r + rec.RED), red),
-        simd.fma(weight, simd.load_one(batch, r + rec.GREEN), green),
-        simd.fma(weight, simd.load_one(batch, r + rec.BLUE), blue),
-        simd.fma(weight, simd.load_one(batch, r + rec.DEPTH), depth),
-    )
+    _, alpha = alpha_of(power)
+    return alpha
 
 
 @inline
@@ -120,11 +132,28 @@ def next_splat(low, high, base):
 
 
 @inline
-def blend_one(batch, r, alpha, t, after, left, sums):
-    """Add one splat where it leaves the pixel open; returns the transmittance left and the sums."""
+def blend_one(batch, r, alpha, t, after, kept):
+    """Add one splat where it leaves the pixel open; ``kept``: the transmittance left, sums of colour and of depth."""
+    left, color, depth = kept
     open_ = after >= TRANSMITTANCE_MIN
     weight = simd.where(open_, alpha * t, 0)
-    return simd.where(open_, after, left), accumulate(batch, r, weight, sums)
+    color = fma3(weight, rec.load3(batch, r + rec.RED), color)
+    depth = simd.fma(weight, simd.load_one(batch, r + rec.DEPTH), depth)
+    return simd.where(open_, after, left), color, depth
+
+
+@inline
+def load_color(state, o):
+    """Sums of colour of one block in the scratch of the forward pass."""
+    return simd.load(state, R_SUM + o), simd.load(state, G_SUM + o), simd.load(state, B_SUM + o)
+
+
+@inline
+def store_color(state, o, color):
+    """The inverse of :func:`load_color`."""
+    simd.store(state, R_SUM + o, color[0])
+    simd.store(state, G_SUM + o, color[1])
+    simd.store(state, B_SUM + o, color[2])
 
 
 # Lower bound on the transmittance of closed pixels: far below the threshold, far above denormal numbers.
@@ -135,10 +164,9 @@ TINY = F(1e-20)
 def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
     """Blend a batch into one block; returns the block's bit, or 0 once all its pixels are closed."""
     o = 16 * block
-    t, left = simd.load(state, T + o), simd.load(state, T_LEFT + o)
-    red, green, blue = simd.load(state, R_SUM + o), simd.load(state, G_SUM + o), simd.load(state, B_SUM + o)
-    sums = red, green, blue, simd.load(state, Z_SUM + o)
-    x, y = simd.load(grid, o), simd.load(grid, 256 + o)
+    t = simd.load(state, T + o)
+    kept = simd.load(state, T_LEFT + o), load_color(state, o), simd.load(state, Z_SUM + o)
+    x, y = pixels_of(grid, block)
     bit = 1 << block
     low = waiting(touched, first, count, block)
     high = waiting(touched, first + 64, count - 64, block)
@@ -155,10 +183,10 @@ def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
         t2 = simd.fnma(a1, t1, t1)
         t3 = simd.fnma(a2, t2, t2)
         t4 = simd.fnma(a3, t3, t3)
-        left, sums = blend_one(batch, r0, a0, t, t1, left, sums)
-        left, sums = blend_one(batch, r1, a1, t1, t2, left, sums)
-        left, sums = blend_one(batch, r2, a2, t2, t3, left, sums)
-        left, sums = blend_one(batch, r3, a3, t3, t4, left, sums)
+        kept = blend_one(batch, r0, a0, t, t1, kept)
+        kept = blend_one(batch, r1, a1, t1, t2, kept)
+        kept = blend_one(batch, r2, a2, t2, t3, kept)
+        kept = blend_one(batch, r3, a3, t3, t4, kept)
         if drop_closed and simd.mask_bits(t4 >= TRANSMITTANCE_MIN) == 0:
             for j in range(j3 + 1, count):
                 simd.put(touched, first + j, simd.get(touched, first + j) & ~bit)
@@ -167,38 +195,34 @@ def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
         # The transmittance of closed pixels keeps falling; keep it clear of denormals.
         t = simd.maximum(t4, TINY)
     simd.store(state, T + o, t)
+    left, color, depth = kept
     simd.store(state, T_LEFT + o, left)
-    simd.store(state, R_SUM + o, sums[0])
-    simd.store(state, G_SUM + o, sums[1])
-    simd.store(state, B_SUM + o, sums[2])
-    simd.store(state, Z_SUM + o, sums[3])
+    store_color(state, o, color)
+    simd.store(state, Z_SUM + o, depth)
     return bit
 
 
 @inline
 def write_block(block, corner, size, background, state, planes):
     """Add the background and write one block, pixel by pixel where it extends beyond the image."""
-    (left, top), (width, height), (image, transmittance, depth) = corner, size, planes
+    width, height = size
+    image, transmittance, depth = planes
     o = 16 * block
-    x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
+    x0, y0 = block_corner(block, corner)
     t = simd.load(state, T_LEFT + o)
-    red = simd.fma(t, simd.load_one(background, 0), simd.load(state, R_SUM + o))
-    green = simd.fma(t, simd.load_one(background, 1), simd.load(state, G_SUM + o))
-    blue = simd.fma(t, simd.load_one(background, 2), simd.load(state, B_SUM + o))
+    color = fma3(t, rec.load3(background, 0), load_color(state, o))
     if x0 + BLOCK_SIDE <= width and y0 + BLOCK_SIDE <= height:
         pixel = y0 * width + x0
-        simd.store_block3(image, 3 * pixel, 3 * width, (red, green, blue))
+        simd.store_block3(image, 3 * pixel, 3 * width, color)
         simd.store_block1(transmittance, pixel, width, (t,))
         simd.store_block1(depth, pixel, width, (simd.load(state, Z_SUM + o),))
         return
-    simd.store(state, T_LEFT + o, t)
-    simd.store(state, R_SUM + o, red)
-    simd.store(state, G_SUM + o, green)
-    simd.store(state, B_SUM + o, blue)
+    store_color(state, o, color)
     for lane in range(16):
         x, y = x0 + (lane & 3), y0 + (lane >> 2)
         if x < width and y < height:
-            pixel, s = y * width + x, o + lane
+            pixel = y * width + x
+            s = o + lane
             simd.put(transmittance, pixel, simd.get(state, T_LEFT + s))
             simd.put(depth, pixel, simd.get(state, Z_SUM + s))
             simd.put(image, 3 * pixel, simd.get(state, R_SUM + s))
@@ -214,11 +238,11 @@ AHEAD = 24
 def blend_tile(records, entries, begin, end, corner, size, background, grid, touched, planes, state, skips):
     """Blend one tile; returns the end of the part of its list that was processed."""
     cull_blocks, drop_closed = skips
-    fx, fy = F(corner[0]), F(corner[1])
     columns, rows = F(size[0] - corner[0]), F(size[1] - corner[1])
     alive = 0
     for block in range(BLOCKS):
-        inside = (simd.load(grid, 16 * block) < columns) & (simd.load(grid, 256 + 16 * block) < rows)
+        x, y = pixels_of(grid, block)
+        inside = (x < columns) & (y < rows)
         simd.store(state, T + 16 * block, simd.where(inside, 1, 0))
         simd.store(state, T_LEFT + 16 * block, simd.where(inside, 1, 0))
         for plane in range(2, 6):
@@ -230,23 +254,21 @@ def blend_tile(records, entries, begin, end, corner, size, background, grid, tou
     simd.store(batch, BATCH * rec.RECORD, 0)
     simd.put(batch, BATCH * rec.RECORD + rec.LOG2_OPACITY, F(-100))
     for i in range(begin, min(end, begin + AHEAD)):
-        simd.prefetch(records, rec.RECORD * np.int64(simd.get(entries, i)))
+        simd.prefetch(records, rec.record_of(entries, i))
     i = begin
     while i < end and alive != 0:
         count = min(BATCH, end - i)
         reached = 0
         for j in range(count):
             if i + j + AHEAD < end:
-                simd.prefetch(records, rec.RECORD * np.int64(simd.get(entries, i + j + AHEAD)))
-            r = rec.RECORD * np.int64(simd.get(entries, i + j))
+                simd.prefetch(records, rec.record_of(entries, i + j + AHEAD))
+            r = rec.record_of(entries, i + j)
             o = rec.RECORD * j
             simd.store(batch, o, simd.load(records, r))
-            x, y = simd.get(records, r + rec.X) - fx, simd.get(records, r + rec.Y) - fy
+            center_x, center_y, (_, _, _, u0, v0) = in_tile(records, r, corner)
             mask = alive
             if cull_blocks:
-                mask &= reachable_blocks(batch, o, x, y, grid)
-            a, b, c = simd.get(records, r + rec.A), simd.get(records, r + rec.B), simd.get(records, r + rec.C)
-            u0, v0 = offsets_at(a, b, c, x, y)
+                mask &= reachable_blocks(batch, o, center_x, center_y, grid)
             simd.put(batch, o + rec.X, u0)
             simd.put(batch, o + rec.Y, v0)
             simd.put(touched, i + j, mask)
@@ -305,18 +327,19 @@ def start_block(block, corner, size, planes, gradients, pixel_weights, wanted, g
     Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end. Gradients that are not needed are not read, nor
     is a map.
     """
-    (left, top), (width, height), (image, transmittance, depth) = corner, size, planes
+    width, height = size
+    image, transmittance, depth = planes
     g_image, g_alpha, g_depth = gradients
     with_alpha, with_depth, with_absgrad = wanted
     s = BLOCK_STATE * block
-    x0, y0 = left + (block & 3) * BLOCK_SIDE, top + (block >> 2) * BLOCK_SIDE
-    simd.store(state, s + BACK_X, simd.load(grid, 16 * block))
-    simd.store(state, s + BACK_Y, simd.load(grid, 256 + 16 * block))
+    x0, y0 = block_corner(block, corner)
+    x, y = pixels_of(grid, block)
+    simd.store(state, s + BACK_X, x)
+    simd.store(state, s + BACK_Y, y)
     if x0 + BLOCK_SIDE <= width and y0 + BLOCK_SIDE <= height:
         pixel = y0 * width + x0
         red, green, blue = simd.load_block3(g_image, 3 * pixel, 3 * width)
-        r, g, b = simd.load_block3(image, 3 * pixel, 3 * width)
-        rest = simd.fma(red, r, simd.fma(green, g, blue * b))
+        rest = dot3((red, green, blue), simd.load_block3(image, 3 * pixel, 3 * width))
         if with_alpha:
             kept = simd.load_block1(transmittance, pixel, width)[0]
             rest = simd.fnma(simd.load_block1(g_alpha, pixel, width)[0], kept, rest)
@@ -335,9 +358,10 @@ def start_block(block, corner, size, planes, gradients, pixel_weights, wanted, g
     for part in range(0, BACK_X, 16):
         simd.store(state, s + part, 0)
     for lane in range(16):
-        x, y = x0 + (lane & 3), y0 + (lane >> 2)
-        if x < width and y < height:
-            pixel, o = y * width + x, s + lane
+        column, row = x0 + (lane & 3), y0 + (lane >> 2)
+        if column < width and row < height:
+            pixel = row * width + column
+            o = s + lane
             rest = F(0)
             if with_alpha:
                 rest -= simd.get(g_alpha, pixel) * simd.get(transmittance, pixel)
@@ -371,38 +395,40 @@ def splat_backward(records, row, blocks, corner, wanted, state):
     _, with_depth, with_absgrad = wanted
     zero = simd.broadcast(0)
     r = rec.RECORD * row
-    a, b, c = simd.get(records, r + rec.A), simd.get(records, r + rec.B), simd.get(records, r + rec.C)
-    x, y = simd.get(records, r + rec.X) - F(corner[0]), simd.get(records, r + rec.Y) - F(corner[1])
-    u0, v0 = offsets_at(a, b, c, x, y)
-    peak, z = simd.load_one(records, r + rec.LOG2_OPACITY), simd.load_one(records, r + rec.DEPTH)
-    color = rec.load3(records, r + rec.RED, 1)
-    s_r, s_g, s_b, s_h, s_u, s_v, s_uu, s_uv, s_vv, s_z = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+    _, _, (a, b, c, u0, v0) = in_tile(records, r, corner)
+    peak = simd.load_one(records, r + rec.LOG2_OPACITY)
+    z = simd.load_one(records, r + rec.DEPTH)
+    color = rec.load3(records, r + rec.RED)
+    s_color = s_squares = zero, zero, zero
+    s_h, s_u, s_v, s_z = zero, zero, zero, zero
     s_ax, s_ay, s_map = zero, zero, zero
     while blocks != 0:
         s = BLOCK_STATE * simd.lowest_bit(blocks)
         blocks &= blocks - 1
         power, u, v = exponent(a, b, c, u0, v0, peak, simd.load(state, s + BACK_X), simd.load(state, s + BACK_Y))
-        g_r, g_g = simd.load(state, s + BACK_RED), simd.load(state, s + BACK_GREEN)
-        g_b = simd.load(state, s + BACK_BLUE)
-        d = dot3((g_r, g_g, g_b), color)
+        g = simd.load(state, s + BACK_RED), simd.load(state, s + BACK_GREEN), simd.load(state, s + BACK_BLUE)
+        d = dot3(g, color)
         if with_depth:
             d = simd.fma(simd.load(state, s + BACK_DEPTH), z, d)
-        t, rest = simd.load(state, s + BACK_T), simd.load(state, s + BACK_REST)
+        t = simd.load(state, s + BACK_T)
+        rest = simd.load(state, s + BACK_REST)
         raw, alpha, after, open_, weight = blend_step(power, t)
         simd.store(state, s + BACK_REST, simd.fnma(weight, d, rest))
         simd.store(state, s + BACK_T, simd.maximum(after, TINY))
         h = simd.where(open_ & (raw <= ALPHA_MAX), alpha / (1 - alpha) * (t * d - rest), 0)
-        s_r, s_g, s_b = simd.fma(weight, g_r, s_r), simd.fma(weight, g_g, s_g), simd.fma(weight, g_b, s_b)
+        s_color = fma3(weight, g, s_color)
         hu, hv = h * u, h * v
         s_h, s_u, s_v = s_h + h, s_u + hu, s_v + hv
-        s_uu, s_uv, s_vv = simd.fma(hu, u, s_uu), simd.fma(hu, v, s_uv), simd.fma(hv, v, s_vv)
+        s_uu, s_uv, s_vv = s_squares
+        s_squares = simd.fma(hu, u, s_uu), simd.fma(hu, v, s_uv), simd.fma(hv, v, s_vv)
         if with_depth:
             s_z = simd.fma(weight, simd.load(state, s + BACK_DEPTH), s_z)
         if with_absgrad:
             along_y = simd.fma(b, hu, c * hv)
-            s_ax, s_ay = s_ax + simd.maximum(hu, 0 - hu), s_ay + simd.maximum(along_y, 0 - along_y)
+            s_ax = s_ax + simd.maximum(hu, 0 - hu)
+            s_ay = s_ay + simd.maximum(along_y, 0 - along_y)
             s_map = simd.fma(weight, simd.load(state, s + BACK_WEIGHT), s_map)
-    return simd.lane_sums((s_r, s_g, s_b, s_h, s_u, s_v, s_uu, s_uv, s_vv, s_z, s_ax, s_ay, s_map))
+    return simd.lane_sums((*s_color, s_h, s_u, s_v, *s_squares, s_z, s_ax, s_ay, s_map))
 
 
 # How many entries ahead a slot is prefetched, whose number is in the record: later than that.
@@ -414,7 +440,7 @@ def tile_backward(records, integers, entries, begin, end, corner, group, wanted,
     """Add up the gradients of all splats of a tile, front to back."""
     for i in range(begin, end):
         if i + AHEAD < end:
-            simd.prefetch(records, rec.RECORD * np.int64(simd.get(entries, i + AHEAD)))
+            simd.prefetch(records, rec.record_of(entries, i + AHEAD))
         if i + SLOT_AHEAD < end:
             coming = np.int64(simd.get(entries, i + SLOT_AHEAD))
             simd.prefetch(sums, rec.RECORD * slot_of(integers, coming, group))
@@ -461,14 +487,14 @@ def total_slots(thread, threads, ids, count, slots, records, integers, sums, g_m
 
     ``with_absgrad`` also writes sums over the pixels ``[N·3]``: Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · pixel weight.
     """
-    last = count * (thread + 1) // threads
-    for i in range(count * thread // threads, last):
+    first, last = rec.share(count, thread, threads)
+    for i in range(first, last):
         row = np.int64(simd.get(ids, i))
         r = rec.RECORD * row
         slot = np.int64(simd.get(integers, r + rec.SLOT))
         end = np.int64(slots)
         if i + 1 < count:
-            end = np.int64(simd.get(integers, rec.RECORD * np.int64(simd.get(ids, i + 1)) + rec.SLOT))
+            end = np.int64(simd.get(integers, rec.record_of(ids, i + 1) + rec.SLOT))
         o = rec.RECORD * slot
         if end > slot + 1:
             total = simd.load(sums, o)
@@ -476,10 +502,10 @@ def total_slots(thread, threads, ids, count, slots, records, integers, sums, g_m
                 total = total + simd.load(sums, rec.RECORD * other)
             simd.store(sums, o, total)
         u, v = simd.get(sums, o + rec.SUM_U), simd.get(sums, o + rec.SUM_V)
-        simd.put(g_means2d, 2 * row, TWO_LN2 * simd.get(records, r + rec.A) * u)
-        b, c = simd.get(records, r + rec.B), simd.get(records, r + rec.C)
+        a, b, c = rec.get3(records, r + rec.A)
+        simd.put(g_means2d, 2 * row, TWO_LN2 * a * u)
         simd.put(g_means2d, 2 * row + 1, TWO_LN2 * (b * u + c * v))
         if with_absgrad:
-            simd.put(absgrad, 3 * row, abs(TWO_LN2 * simd.get(records, r + rec.A)) * simd.get(sums, o + rec.ABS_X))
+            simd.put(absgrad, 3 * row, abs(TWO_LN2 * a) * simd.get(sums, o + rec.ABS_X))
             simd.put(absgrad, 3 * row + 1, TWO_LN2 * simd.get(sums, o + rec.ABS_Y))
             simd.put(absgrad, 3 * row + 2, simd.get(sums, o + rec.SUM_WEIGHT))

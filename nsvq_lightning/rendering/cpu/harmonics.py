@@ -87,7 +87,7 @@ def color_range(camera, means, colors, bands, ids, first, last, records, scratch
     for start in range(first, last, 16):
         prefetch_sh(shN, ids, start + AHEAD, last, stride, coefficients)
         mean = simd.gather_rows3(means, ids, start)
-        direction, _ = unit_direction(rec.load3(camera, rec.POSITION, 1), mean)
+        direction, _ = unit_direction(rec.load3(camera, rec.POSITION), mean)
         if degree > 0:
             gather_sh(shN, ids, start, stride, coefficients, scratch)
         rgb = clamped(color(degree, direction, simd.gather_rows3(sh0, ids, start), scratch))
@@ -145,7 +145,7 @@ def scatter_sh(gradient, columns, ids, start, stride, count):
 def color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, scratch):
     """Gradients of the SH coefficients; returns that of the mean through the viewing direction."""
     stride, degree = bands
-    d, inverse = unit_direction(rec.load3(camera, rec.POSITION, 1), mean)
+    d, inverse = unit_direction(rec.load3(camera, rec.POSITION), mean)
     coefficients = coefficients_of(degree)
     columns, gradient, e = scratch[:768], scratch[768:1536], scratch[1536:]
     if degree > 0:

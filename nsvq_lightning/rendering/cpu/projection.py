@@ -94,7 +94,7 @@ def project_splats(
     thread, threads, camera, antialiased, means, quats, scales, logits, records, integers, found, counts, slots, scratch
 ):
     """Write the records of all visible splats; ``found`` gets a run of rows for each thread's range."""
-    first, last = rec.vector_range(logits.shape[0], thread, threads)
+    first, last = rec.vector_share(logits.shape[0], thread, threads)
     counts[thread], slots[thread] = project_range(
         camera, antialiased, means, quats, scales, logits, first, last, records, integers, found, scratch[thread]
     )
@@ -113,7 +113,7 @@ def join_runs(thread, threads, runs, records, integers, listed, means2d, radii):
     found, counts, slots = runs
     ids, keys, order, boxes = listed
     total = counts.sum()
-    first, _ = rec.vector_range(records.shape[0] // rec.RECORD, thread, threads)
+    first, _ = rec.vector_share(records.shape[0] // rec.RECORD, thread, threads)
     start, slot = counts[:thread].sum(), slots[:thread].sum()
     for k in range(counts[thread]):
         row = np.int64(simd.get(found, first + k))
@@ -139,5 +139,5 @@ def add_colors(thread, threads, camera, means, colors, bands, ids, count, record
 
     ``colors`` are sh0 and shN, ``bands`` the floats in a row of shN and the degree that counts.
     """
-    first, last = rec.vector_range(count, thread, threads)
+    first, last = rec.vector_share(count, thread, threads)
     color_range(camera, means, colors, bands, ids, first, last, records, scratch[thread])

@@ -38,7 +38,7 @@ def project_backward(
     work = scratch[thread]
     slot = work[2048:].view(np.int32)
     # Between its first and last visible splat, every thread clears the rows that it skips.
-    begin, end = rec.vector_range(count, thread, threads)
+    begin, end = rec.vector_share(count, thread, threads)
     row = np.int64(simd.get(ids, begin - 1)) + 1 if begin > 0 else 0
     for i in range(begin, end):
         here = np.int64(simd.get(ids, i))

@@ -241,6 +241,6 @@ def visible(splats: SplatTensors, camera: Camera) -> Tensor:
     """
     frame = _Frame(splats, camera)
     found, counts, _ = frame.find()
-    starts = (rec.vector_range.py_func(frame.n, thread, frame.threads)[0] for thread in range(frame.threads))
+    starts = (rec.vector_share.py_func(frame.n, thread, frame.threads)[0] for thread in range(frame.threads))
     runs = [found[start : start + count] for start, count in zip(starts, counts, strict=True)]
     return torch.from_numpy(np.concatenate(runs, dtype=np.int64))

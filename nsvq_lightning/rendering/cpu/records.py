@@ -73,24 +73,41 @@ def group_grid(width: int, height: int) -> tuple[int, int]:
 
 
 @inline
-def load3(array, offset, stride):
+def get3(array, offset):
+    """Three consecutive numbers."""
+    return simd.get(array, offset), simd.get(array, offset + 1), simd.get(array, offset + 2)
+
+
+@inline
+def load3(array, offset):
     """A vector that is the same for all splats."""
-    x, y = simd.load_one(array, offset), simd.load_one(array, offset + stride)
-    return x, y, simd.load_one(array, offset + 2 * stride)
+    return simd.load_one(array, offset), simd.load_one(array, offset + 1), simd.load_one(array, offset + 2)
+
+
+@inline
+def record_of(rows, i):
+    """Where the record of the i-th of some rows begins."""
+    return RECORD * np.int64(simd.get(rows, i))
 
 
 @inline
 def load_view(camera):
     """The view of :mod:`nsvq_lightning.rendering.formulas`."""
-    rotation = load3(camera, ROTATION, 1), load3(camera, ROTATION + 3, 1), load3(camera, ROTATION + 6, 1)
+    rotation = load3(camera, ROTATION), load3(camera, ROTATION + 3), load3(camera, ROTATION + 6)
     focal = simd.load_one(camera, FX), simd.load_one(camera, FY)
     slopes_x = simd.load_one(camera, LOW_X), simd.load_one(camera, HIGH_X)
     slopes_y = simd.load_one(camera, LOW_Y), simd.load_one(camera, HIGH_Y)
-    return rotation, load3(camera, TRANSLATION, 1), focal, slopes_x, slopes_y
+    return rotation, load3(camera, TRANSLATION), focal, slopes_x, slopes_y
 
 
 @inline
-def vector_range(count, thread, threads):
-    """First and end of a thread's share of ``count`` splats: whole vectors, except for the very last one."""
+def share(count, thread, threads):
+    """First and end of a thread's share of ``count`` things."""
+    return count * thread // threads, count * (thread + 1) // threads
+
+
+@inline
+def vector_share(count, thread, threads):
+    """The same of ``count`` splats: whole vectors, except for the very last one."""
     vectors = (count + 15) // 16
     return 16 * (vectors * thread // threads), min(count, 16 * (vectors * (thread + 1) // threads))

@@ -8,14 +8,16 @@ from torch import Tensor
 from nsvq_lightning.compute.jit import F, parallel, thread_count
 from nsvq_lightning.compute.memory import INT32, flat_checked
 from nsvq_lightning.compute.simd import get, put
+from nsvq_lightning.rendering.cpu.records import share
 
 
 @parallel
 def _add(thread, threads, gradients, columns, radii, x_factor, y_factor, factor, sums, views, weights):
-    count = radii.shape[0]
-    for i in range(count * thread // threads, count * (thread + 1) // threads):
+    first, end = share(radii.shape[0], thread, threads)
+    for i in range(first, end):
         if get(radii, i) > 0:
-            x, y = x_factor * get(gradients, columns * i), y_factor * get(gradients, columns * i + 1)
+            x = x_factor * get(gradients, columns * i)
+            y = y_factor * get(gradients, columns * i + 1)
             put(sums, i, get(sums, i) + np.sqrt(x * x + y * y))
             put(views, i, get(views, i) + F(1))
             if columns == 3 and get(gradients, 3 * i + 2) > 0:
