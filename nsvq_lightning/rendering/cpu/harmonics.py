@@ -7,7 +7,17 @@ from nsvq_lightning.compute.jit import inline
 from nsvq_lightning.compute.rows import clear
 from nsvq_lightning.rendering import formulas
 from nsvq_lightning.rendering.cpu import records as rec
-from nsvq_lightning.rendering.formulas import C0, bands1, bands2, bands3, clamped, mean_gradient, scale3, unit_direction
+from nsvq_lightning.rendering.formulas import (
+    C0,
+    bands1,
+    bands2,
+    bands3,
+    clamped,
+    fma3,
+    mean_gradient,
+    scale3,
+    unit_direction,
+)
 
 # How many splats ahead the rows of a list are prefetched.
 AHEAD = 32
@@ -18,7 +28,7 @@ def prefetch_sh(array, ids, start, end, stride, used):
     """Prefetch the SH rows of 16 later splats of the list, ``used`` floats of each."""
     if start < end:
         for lane in range(16):
-            row = stride * np.int64(simd.get(ids, start + lane))
+            row = np.int64(simd.get(ids, start + lane)) * stride
             for k in range(0, used, 16):
                 simd.prefetch(array, row + k)
 
@@ -53,11 +63,8 @@ def gather_sh(shN, ids, start, stride, count, columns):
 def add_band(columns, k, basis, rgb):
     """Add coefficient k (counted without the constant one) times its basis value to a colour."""
     o = 48 * k
-    return (
-        simd.fma(simd.load(columns, o), basis, rgb[0]),
-        simd.fma(simd.load(columns, o + 16), basis, rgb[1]),
-        simd.fma(simd.load(columns, o + 32), basis, rgb[2]),
-    )
+    coefficient = simd.load(columns, o), simd.load(columns, o + 16), simd.load(columns, o + 32)
+    return fma3(basis, coefficient, rgb)
 
 
 @inline
@@ -94,23 +101,19 @@ def color_range(camera, means, colors, bands, ids, first, last, records, scratch
         for channel in range(3):
             simd.store(scratch, 16 * channel, rgb[channel])
         for lane in range(min(16, last - start)):
-            o = rec.RECORD * np.int64(simd.get(ids, start + lane)) + rec.RED
-            simd.put(records, o, simd.get(scratch, lane))
-            simd.put(records, o + 1, simd.get(scratch, 16 + lane))
-            simd.put(records, o + 2, simd.get(scratch, 32 + lane))
+            o = rec.record_of(ids, start + lane) + rec.RED
+            for channel in range(3):
+                simd.put(records, o + channel, simd.get(scratch, 16 * channel + lane))
 
 
 @inline
 def direction_gradient(degree, d, e):
     """dL/d(direction) from the scratch vectors ``e[16·k]`` = Σ_channel coefficient·gradient of each band."""
-    g = formulas.direction_gradient1((simd.load(e, 0), simd.load(e, 16), simd.load(e, 32)))
+    g = formulas.direction_gradient1(simd.load_vectors(e, 0)[:3])
     if degree > 1:
-        e0, e1, e2, e3, e4 = simd.load(e, 48), simd.load(e, 64), simd.load(e, 80), simd.load(e, 96), simd.load(e, 112)
-        g = formulas.direction_gradient2(g, d, (e0, e1, e2, e3, e4))
+        g = formulas.direction_gradient2(g, d, simd.load_vectors(e, 0)[3:8])
     if degree > 2:
-        e0, e1, e2, e3 = simd.load(e, 128), simd.load(e, 144), simd.load(e, 160), simd.load(e, 176)
-        e4, e5, e6 = simd.load(e, 192), simd.load(e, 208), simd.load(e, 224)
-        g = formulas.direction_gradient3(g, d, (e0, e1, e2, e3, e4, e5, e6))
+        g = formulas.direction_gradient3(g, d, simd.load_vectors(e, 0)[8:15])
     return g
 
 

@@ -12,35 +12,36 @@ from nsvq_lightning.rendering.formulas import footprint, view_point
 @inline
 def load_screen(camera):
     """The screen of :func:`nsvq_lightning.rendering.formulas.footprint`."""
-    cx, cy = simd.load_one(camera, rec.CX), simd.load_one(camera, rec.CY)
-    width, height = simd.load_one(camera, rec.WIDTH), simd.load_one(camera, rec.HEIGHT)
-    return cx, cy, width, height, simd.load_one(camera, rec.NEAR)
+    width, height, near = rec.load3(camera, rec.WIDTH)
+    return simd.load_one(camera, rec.CX), simd.load_one(camera, rec.CY), width, height, near
 
 
 @inline
-def load_means(means, start, count, scratch):
-    """16 means; the last, incomplete vector is read from a padded copy."""
+def copy_to(scratch, array, first, count):
+    """Copy some numbers, behind which there is room to read a whole vector."""
+    for k in range(count):
+        simd.put(scratch, k, simd.get(array, first + k))
+
+
+@inline
+def load3(array, start, count, scratch):
+    """16 rows of three; the last, incomplete vector is read from a copy."""
     if count < 16:
-        for k in range(3 * count):
-            simd.put(scratch, k, simd.get(means, 3 * start + k))
+        copy_to(scratch, array, 3 * start, 3 * count)
         return simd.load_rows3(scratch, 0)
-    return simd.load_rows3(means, 3 * start)
+    return simd.load_rows3(array, 3 * start)
 
 
 @inline
 def load_shapes(quats, scales, logits, start, count, scratch):
-    """16 quaternions, log scales and opacity logits, an incomplete vector as in :func:`load_means`."""
+    """16 quaternions, log scales and opacity logits, an incomplete vector as in :func:`load3`."""
+    scale = load3(scales, start, count, scratch)
     if count < 16:
-        for k in range(4 * count):
-            simd.put(scratch, k, simd.get(quats, 4 * start + k))
+        copy_to(scratch, quats, 4 * start, 4 * count)
         quat = simd.load_rows4(scratch, 0)
-        for k in range(3 * count):
-            simd.put(scratch, k, simd.get(scales, 3 * start + k))
-        scale = simd.load_rows3(scratch, 0)
-        for k in range(count):
-            simd.put(scratch, k, simd.get(logits, start + k))
+        copy_to(scratch, logits, start, count)
         return quat, scale, simd.load(scratch, 0)
-    return simd.load_rows4(quats, 4 * start), simd.load_rows3(scales, 3 * start), simd.load(logits, start)
+    return simd.load_rows4(quats, 4 * start), scale, simd.load(logits, start)
 
 
 @inline
@@ -51,7 +52,7 @@ def project_range(camera, antialiased, means, quats, scales, logits, first, last
     slots = 0
     for start in range(first, last, 16):
         count = min(16, last - start)
-        mean = load_means(means, start, count, scratch)
+        mean = load3(means, start, count, scratch)
         lanes = (1 << count) - 1
         view = rec.load_view(camera)
         point = view_point(view, mean)
@@ -62,9 +63,8 @@ def project_range(camera, antialiased, means, quats, scales, logits, first, last
         bits = simd.mask_bits(seen) & lanes
         if bits == 0:
             continue
-        x, y, a, b, c, opacity, depth, slope_x, slope_y = record
-        fields = (x, y, a, b, c, opacity, zero, zero, zero, depth, slope_x, slope_y, zero, zero, zero, zero)
-        rows = simd.transpose(fields)
+        color = later = zero, zero, zero
+        rows = simd.transpose((*record[: rec.RED], *color, *record[rec.RED :], zero, *later))
         for lane in range(16):
             simd.store(scratch, 128 + 16 * lane, rows[lane])
         for k in range(2):
@@ -75,13 +75,14 @@ def project_range(camera, antialiased, means, quats, scales, logits, first, last
             lane = simd.lowest_bit(bits)
             bits &= bits - 1
             row = start + lane
-            simd.store(records, rec.RECORD * row, simd.load(scratch, 128 + 16 * lane))
+            o = rec.RECORD * row
+            simd.store(records, o, simd.load(scratch, 128 + 16 * lane))
             x0, y0 = np.int64(simd.get(scratch, lane)), np.int64(simd.get(scratch, 16 + lane))
             x1, y1 = np.int64(simd.get(scratch, 32 + lane)), np.int64(simd.get(scratch, 48 + lane))
-            simd.put(integers, rec.RECORD * row + rec.SLOT, slots)
-            simd.put(integers, rec.RECORD * row + rec.ORIGIN, x0 | (y0 << 16))
-            simd.put(integers, rec.RECORD * row + rec.EXTENT, (x1 - x0 + 1) | ((y1 - y0 + 1) << 16))
-            simd.put(integers, rec.RECORD * row + rec.RADIUS, np.int64(min(simd.get(scratch, 64 + lane), F(1e9))))
+            simd.put(integers, o + rec.SLOT, slots)
+            simd.put(integers, o + rec.ORIGIN, x0 | (y0 << 16))
+            simd.put(integers, o + rec.EXTENT, (x1 - x0 + 1) | ((y1 - y0 + 1) << 16))
+            simd.put(integers, o + rec.RADIUS, np.int64(min(simd.get(scratch, 64 + lane), F(1e9))))
             columns = (x1 >> rec.GROUP_SHIFT) - (x0 >> rec.GROUP_SHIFT) + 1
             slots += columns * ((y1 >> rec.GROUP_SHIFT) - (y0 >> rec.GROUP_SHIFT) + 1)
             simd.put(ids, first + visible, row)
@@ -117,17 +118,17 @@ def join_runs(thread, threads, runs, records, integers, listed, means2d, radii):
     start, slot = counts[:thread].sum(), slots[:thread].sum()
     for k in range(counts[thread]):
         row = np.int64(simd.get(found, first + k))
+        o = rec.RECORD * row
         simd.put(ids, start + k, row)
-        place = rec.RECORD * row + rec.SLOT
-        simd.put(integers, place, np.int64(simd.get(integers, place)) + slot)
+        simd.put(integers, o + rec.SLOT, np.int64(simd.get(integers, o + rec.SLOT)) + slot)
         # Depths are positive, so their bits sort as integers.
-        simd.put(keys, start + k, simd.get(integers, rec.RECORD * row + rec.DEPTH))
+        simd.put(keys, start + k, simd.get(integers, o + rec.DEPTH))
         simd.put(order, start + k, start + k)
-        extent = np.int64(simd.get(integers, rec.RECORD * row + rec.EXTENT))
-        simd.put(boxes, start + k, np.int64(simd.get(integers, rec.RECORD * row + rec.ORIGIN)) | (extent << 32))
-        simd.put(means2d, 2 * row, simd.get(records, rec.RECORD * row + rec.X))
-        simd.put(means2d, 2 * row + 1, simd.get(records, rec.RECORD * row + rec.Y))
-        simd.put(radii, row, simd.get(integers, rec.RECORD * row + rec.RADIUS))
+        extent = np.int64(simd.get(integers, o + rec.EXTENT))
+        simd.put(boxes, start + k, np.int64(simd.get(integers, o + rec.ORIGIN)) | (extent << 32))
+        simd.put(means2d, 2 * row, simd.get(records, o + rec.X))
+        simd.put(means2d, 2 * row + 1, simd.get(records, o + rec.Y))
+        simd.put(radii, row, simd.get(integers, o + rec.RADIUS))
     if start + counts[thread] == total and counts[thread] > 0:
         for k in range(16):
             simd.put(ids, total + k, simd.get(ids, total - 1))

@@ -52,8 +52,8 @@ def project_backward(
         prefetch_sh(g_shN, ids, start + AHEAD, end, stride, stride)
         if start + AHEAD < end:
             for lane in range(16):
-                row = rec.RECORD * np.int64(simd.get(ids, start + AHEAD + lane))
-                simd.prefetch(sums, rec.RECORD * np.int64(simd.get(integers, row + rec.SLOT)))
+                coming = rec.record_of(ids, start + AHEAD + lane)
+                simd.prefetch(sums, rec.record_of(integers, coming + rec.SLOT))
         for lane in range(16):
             row = np.int64(simd.get(ids, start + lane))
             simd.put(slot, lane, simd.get(integers, rec.RECORD * row + rec.SLOT))
@@ -65,16 +65,16 @@ def project_backward(
         mean = simd.gather_rows3(means, ids, start)
         quat, scale = simd.gather_rows4(quats, ids, start), simd.gather_rows3(scales, ids, start)
         view = rec.load_view(camera)
-        factor = record[rec.A], record[rec.B], record[rec.C]
-        moments = total[rec.SUM_UU], total[rec.SUM_UV], total[rec.SUM_VV]
+        factor = record[rec.A : rec.LOG2_OPACITY]
+        moments = total[rec.SUM_UU : rec.SUM_DEPTH]
         g_mean, g_quat, g_scale = formulas.geometry_backward(
             view, formulas.view_point(view, mean), quat, scale, factor, moments, total[rec.SUM_H], (g2x, g2y),
             total[rec.SUM_DEPTH], antialiased,
         )  # fmt: skip
-        colors = record[rec.RED], record[rec.GREEN], record[rec.BLUE]
-        rgb = formulas.unclamped(colors, (total[rec.SUM_RED], total[rec.SUM_GREEN], total[rec.SUM_BLUE]))
-        gx, gy, gz = color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, work)
-        simd.scatter_rows3(g_means, ids, start, (g_mean[0] + gx, g_mean[1] + gy, g_mean[2] + gz))
+        colors = record[rec.RED : rec.DEPTH]
+        rgb = formulas.unclamped(colors, total[rec.SUM_RED : rec.SUM_H])
+        through_color = color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, work)
+        simd.scatter_rows3(g_means, ids, start, formulas.add3(g_mean, through_color))
         simd.scatter_rows4(g_quats, ids, start, g_quat)
         simd.scatter_rows3(g_scales, ids, start, g_scale)
         logit = simd.gather_rows1(logits, ids, start)[0]
