@@ -8,6 +8,8 @@ Every program writes its own sums and one program adds them up: no atomics, the 
 back from the device.
 """
 
+from typing import Any, NamedTuple
+
 import torch
 import triton
 import triton.language as tl
@@ -23,24 +25,47 @@ formulas = for_triton(shared)
 
 
 @triton.jit
-def place(ROWS: tl.constexpr, COLUMNS: tl.constexpr):
-    """Rows ``[ROWS, 1]`` and columns ``[1, COLUMNS]`` of this program, and its number."""
+def place(height, length, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    """Where this program works: rows ``[ROWS, 1]``, columns ``[1, COLUMNS]``; height and length of a plane."""
     row = tl.program_id(0) * ROWS + tl.arange(0, ROWS)[:, None]
     column = tl.program_id(1) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
-    return row, column, tl.program_id(0) * tl.num_programs(1) + tl.program_id(1)
+    return row, column, height, length
 
 
 @triton.jit
-def load_at(plane, row, column, height, length):
-    """Values of a plane, 0 outside it."""
+def own_sums(sums):
+    """Where this program writes its two sums."""
+    return sums + 2 * (tl.program_id(0) * tl.num_programs(1) + tl.program_id(1))
+
+
+@triton.jit
+def plane_of(planes, number, at):
+    """Where a plane begins; they follow one another."""
+    _, _, height, length = at
+    return planes + tl.cast(height, tl.int64) * length * number
+
+
+@triton.jit
+def pointers(plane, at, down, along):
+    """To this program's place in a plane, moved so many rows down and floats along; and which are inside the plane."""
+    row, column, height, length = at
+    row, column = row + down, column + along
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < length)
-    return tl.load(plane + row.to(tl.int64) * length + column, mask=inside, other=0.0)
+    return plane + row.to(tl.int64) * length + column, inside
 
 
 @triton.jit
-def clamped(image, row, column, height, length):
-    """The image clamped to [0, 1]."""
-    return formulas.clamped(load_at(image, row, column, height, length))
+def load_at(plane, at, down, along):
+    """Values of a plane, 0 outside it."""
+    place, inside = pointers(plane, at, down, along)
+    return tl.load(place, mask=inside, other=0)
+
+
+@triton.jit
+def store_at(plane, at, values):
+    """Store the values at this program's own place in a plane."""
+    place, inside = pointers(plane, at, 0, 0)
+    tl.store(place, values, mask=inside)
 
 
 # The taps of the window, from the middle outwards.
@@ -49,21 +74,13 @@ WHITE = tl.constexpr(255.0)
 
 
 @triton.jit
-def photo(target, row, column, height, length, BYTES: tl.constexpr):
-    """The target in [0, 1]."""
-    inside = (row >= 0) & (row < height) & (column < length)
-    value = tl.load(target + row.to(tl.int64) * length + column, mask=inside, other=0).to(tl.float32)
+def pixels(image, target, at, down, BYTES: tl.constexpr):
+    """The image clamped to [0, 1], and the target in [0, 1], so many rows down."""
+    p = formulas.clamped(load_at(image, at, down, 0))
+    q = load_at(target, at, down, 0).to(tl.float32)
     if BYTES:
-        value = tl.div_rn(value, tl.full(value.shape, WHITE, tl.float32))
-    return value
-
-
-@triton.jit
-def add_moments(sums, image, target, row, column, height, length, k, tap, BYTES: tl.constexpr):
-    """Add the moments of the rows k above and below, which share a tap."""
-    p, q = clamped(image, row - k, column, height, length), photo(target, row - k, column, height, length, BYTES)
-    r, s = clamped(image, row + k, column, height, length), photo(target, row + k, column, height, length, BYTES)
-    return formulas.add_moments(sums, tap, p, q, r, s)
+        q = tl.div_rn(q, tl.full(q.shape, WHITE, tl.float32))
+    return p, q
 
 
 @triton.jit
@@ -71,39 +88,34 @@ def moments_kernel(
     image, target, moments, sums, height, length, BYTES: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr
 ):  # fmt: skip
     """Vertical blur of the four moment planes; sum of the absolute differences into ``sums[2·program]``."""
-    row, column, program = place(ROWS, COLUMNS)
-    p, q = clamped(image, row, column, height, length), photo(target, row, column, height, length, BYTES)
+    at = place(height, length, ROWS, COLUMNS)
+    p, q = pixels(image, target, at, 0, BYTES)
     # Beyond the border both are 0.
-    tl.store(sums + 2 * program, tl.sum(tl.sum(tl.abs(p - q), 1), 0))
+    tl.store(own_sums(sums), tl.sum(tl.sum(tl.abs(p - q), 1), 0))
     blurred = formulas.moments(TAPS[0], p, q)
     for k in tl.static_range(1, RADIUS + 1):
-        blurred = add_moments(blurred, image, target, row, column, height, length, k, TAPS[k], BYTES)
-    inside = (row < height) & (column < length)
-    size = tl.cast(height, tl.int64) * length
-    at = moments + row.to(tl.int64) * length + column
-    tl.store(at, blurred[0], mask=inside)
-    tl.store(at + size, blurred[1], mask=inside)
-    tl.store(at + 2 * size, blurred[2], mask=inside)
-    tl.store(at + 3 * size, blurred[3], mask=inside)
+        p, q = pixels(image, target, at, -k, BYTES)
+        r, s = pixels(image, target, at, k, BYTES)
+        blurred = formulas.add_moments(blurred, TAPS[k], p, q, r, s)
+    for plane in tl.static_range(4):
+        store_at(plane_of(moments, plane, at), at, blurred[plane])
 
 
 @triton.jit
-def blur_down(plane, row, column, height, length):
+def blur_down(plane, at):
     """Eleven taps down a plane."""
-    total = load_at(plane, row, column, height, length) * TAPS[0]
+    total = load_at(plane, at, 0, 0) * TAPS[0]
     for k in tl.static_range(1, RADIUS + 1):
-        pair = load_at(plane, row - k, column, height, length) + load_at(plane, row + k, column, height, length)
-        total += pair * TAPS[k]
+        total += (load_at(plane, at, -k, 0) + load_at(plane, at, k, 0)) * TAPS[k]
     return total
 
 
 @triton.jit
-def blur_along(plane, row, column, height, length):
+def blur_along(plane, at):
     """Eleven taps along the rows of interleaved RGB: neighbouring pixels are 3 floats apart."""
-    total = load_at(plane, row, column, height, length) * TAPS[0]
+    total = load_at(plane, at, 0, 0) * TAPS[0]
     for k in tl.static_range(1, RADIUS + 1):
-        pair = load_at(plane, row, column - 3 * k, height, length) + load_at(plane, row, column + 3 * k, height, length)
-        total += pair * TAPS[k]
+        total += (load_at(plane, at, 0, -3 * k) + load_at(plane, at, 0, 3 * k)) * TAPS[k]
     return total
 
 
@@ -112,20 +124,18 @@ def similarity_kernel(
     moments, derivatives, sums, height, length, DERIVED: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr
 ):  # fmt: skip
     """Sum of SSIM into ``sums[2·program + 1]``; if ``DERIVED``, also its derivatives by blurred p, p² and p·q."""
-    row, column, program = place(ROWS, COLUMNS)
-    inside = (row < height) & (column < length)
-    size = tl.cast(height, tl.int64) * length
-    m1 = blur_along(moments, row, column, height, length)
-    m2 = blur_along(moments + size, row, column, height, length)
-    squares = blur_along(moments + 2 * size, row, column, height, length)
-    product = blur_along(moments + 3 * size, row, column, height, length)
+    at = place(height, length, ROWS, COLUMNS)
+    m1 = blur_along(moments, at)
+    m2 = blur_along(plane_of(moments, 1, at), at)
+    squares = blur_along(plane_of(moments, 2, at), at)
+    product = blur_along(plane_of(moments, 3, at), at)
     similarity, by_mean, by_square, by_product = formulas.similarity(m1, m2, squares, product)
-    tl.store(sums + 2 * program + 1, tl.sum(tl.sum(tl.where(inside, similarity, 0.0), 1), 0))
+    _, inside = pointers(moments, at, 0, 0)
+    tl.store(own_sums(sums) + 1, tl.sum(tl.sum(tl.where(inside, similarity, 0.0), 1), 0))
     if DERIVED:
-        at = derivatives + row.to(tl.int64) * length + column
-        tl.store(at, by_mean, mask=inside)
-        tl.store(at + size, by_square, mask=inside)
-        tl.store(at + 2 * size, by_product, mask=inside)
+        store_at(derivatives, at, by_mean)
+        store_at(plane_of(derivatives, 1, at), at, by_square)
+        store_at(plane_of(derivatives, 2, at), at, by_product)
 
 
 @triton.jit
@@ -144,11 +154,10 @@ def loss_kernel(sums, loss, programs, count, dssim_weight, BLOCK: tl.constexpr):
 @triton.jit
 def spread_kernel(derivatives, blurred, height, length, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
     """Vertical blur of one derivative plane, the one selected by the third axis of the grid."""
-    row, column, _ = place(ROWS, COLUMNS)
-    shift = tl.program_id(2).to(tl.int64) * height * length
-    value = blur_down(derivatives + shift, row, column, height, length)
-    at = row.to(tl.int64) * length + column
-    tl.store(blurred + shift + at, value, mask=(row < height) & (column < length))
+    at = place(height, length, ROWS, COLUMNS)
+    plane = tl.program_id(2)
+    spread = blur_down(plane_of(derivatives, plane, at), at)
+    store_at(plane_of(blurred, plane, at), at, spread)
 
 
 @triton.jit
@@ -157,16 +166,14 @@ def gradient_kernel(
     ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """Gradient of ``scale`` times the loss, 0 where the image was clamped."""
-    row, column, _ = place(ROWS, COLUMNS)
-    size = tl.cast(height, tl.int64) * length
-    raw = load_at(image, row, column, height, length)
-    p, q = clamped(image, row, column, height, length), photo(target, row, column, height, length, BYTES)
-    by_mean = blur_along(blurred, row, column, height, length)
-    by_square = blur_along(blurred + size, row, column, height, length)
-    by_product = blur_along(blurred + 2 * size, row, column, height, length)
-    value = formulas.pixel_gradient(raw, p, q, by_mean, by_square, by_product, l1_step, ssim_step) * tl.load(scale)
-    at = row.to(tl.int64) * length + column
-    tl.store(gradient + at, value, mask=(row < height) & (column < length))
+    at = place(height, length, ROWS, COLUMNS)
+    raw = load_at(image, at, 0, 0)
+    p, q = pixels(image, target, at, 0, BYTES)
+    by_mean = blur_along(blurred, at)
+    by_square = blur_along(plane_of(blurred, 1, at), at)
+    by_product = blur_along(plane_of(blurred, 2, at), at)
+    value = formulas.pixel_gradient(raw, p, q, by_mean, by_square, by_product, l1_step, ssim_step)
+    store_at(gradient, at, value * tl.load(scale))
 
 
 MOMENTS = 4
@@ -179,16 +186,31 @@ COLUMNS = 128
 BLOCK = 1024
 
 
-def _grid(image: Tensor) -> tuple[int, int]:
-    """Programs down and along an image."""
-    return triton.cdiv(image.shape[0], ROWS), triton.cdiv(3 * image.shape[1], COLUMNS)
+class _Launch(NamedTuple):
+    """How kernels are launched on a pair of pictures.
 
+    Attributes:
+        grid: Programs down and along them.
+        size: Their rows, and floats in a row.
+        of_bytes: Whether the target is uint8.
+        tile: Further arguments of every kernel.
+    """
 
-def _check_pictures(image: Tensor, target: Tensor) -> None:
-    check_pair(image, target)
-    check_tensor("image", image, image.shape, image.device)
-    kind = torch.uint8 if target.dtype == torch.uint8 else torch.float32
-    check_tensor("target", target, image.shape, image.device, kind)
+    grid: tuple[int, int]
+    size: tuple[int, int]
+    of_bytes: bool
+    tile: dict[str, Any]
+
+    @classmethod
+    def on(cls, image: Tensor, target: Tensor) -> "_Launch":
+        """Check the pictures first."""
+        check_pair(image, target)
+        of_bytes = target.dtype == torch.uint8
+        check_tensor("image", image, image.shape, image.device)
+        check_tensor("target", target, image.shape, image.device, torch.uint8 if of_bytes else torch.float32)
+        height, width, _ = image.shape
+        grid = triton.cdiv(height, ROWS), triton.cdiv(3 * width, COLUMNS)
+        return cls(grid, (height, 3 * width), of_bytes, {"ROWS": ROWS, "COLUMNS": COLUMNS, **COMPILE})
 
 
 def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float, *, derived: bool = True) -> tuple[Tensor, Tensor]:
@@ -206,18 +228,16 @@ def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float, *, derived: boo
         ValueError: The pictures differ in shape or device or are not ``[H, W, 3]``, or one is not contiguous.
         TypeError: A dtype is wrong.
     """
-    _check_pictures(image, target)
-    height, width = image.shape[:2]
-    length, grid = 3 * width, _grid(image)
+    grid, size, of_bytes, tile = _Launch.on(image, target)
     programs = grid[0] * grid[1]
-    tile = {"ROWS": ROWS, "COLUMNS": COLUMNS, **COMPILE}
-    moments = image.new_empty(MOMENTS, height, width, 3)
-    planes = image.new_empty(DERIVATIVES, height, width, 3) if derived else moments
-    sums, loss = image.new_empty(programs, 2), image.new_empty(())
+    moments = image.new_empty(MOMENTS, *image.shape)
+    planes = image.new_empty(DERIVATIVES, *image.shape) if derived else moments
+    sums = image.new_empty(programs, 2)
+    loss = image.new_empty(())
     with torch.cuda.device_of(image):
-        moments_kernel[grid](image, target, moments, sums, height, length, BYTES=target.dtype == torch.uint8, **tile)
-        similarity_kernel[grid](moments, planes, sums, height, length, DERIVED=derived, **tile)
-        loss_kernel[(1,)](sums, loss, programs, height * length, dssim_weight, BLOCK=BLOCK, **COMPILE)
+        moments_kernel[grid](image, target, moments, sums, *size, BYTES=of_bytes, **tile)
+        similarity_kernel[grid](moments, planes, sums, *size, DERIVED=derived, **tile)
+        loss_kernel[(1,)](sums, loss, programs, image.numel(), dssim_weight, BLOCK=BLOCK, **COMPILE)
     return loss, planes
 
 
@@ -235,17 +255,16 @@ def l1_dssim_backward(image: Tensor, target: Tensor, dssim_weight: float, deriva
         ValueError: As in :func:`l1_dssim`, or the derivatives belong to another picture.
         TypeError: A dtype is wrong.
     """
-    _check_pictures(image, target)
+    grid, size, of_bytes, tile = _Launch.on(image, target)
     check_tensor("derivatives", derivatives, (DERIVATIVES, *image.shape), image.device)
     check_tensor("scale", scale, (), image.device)
-    height, width = image.shape[:2]
-    length, grid, count = 3 * width, _grid(image), image.numel()
-    tile = {"ROWS": ROWS, "COLUMNS": COLUMNS, **COMPILE}
-    blurred, gradient = torch.empty_like(derivatives), torch.empty_like(image)
+    count = image.numel()
+    blurred = torch.empty_like(derivatives)
+    gradient = torch.empty_like(image)
     with torch.cuda.device_of(image):
-        spread_kernel[(*grid, DERIVATIVES)](derivatives, blurred, height, length, **tile)
+        spread_kernel[(*grid, DERIVATIVES)](derivatives, blurred, *size, **tile)
         gradient_kernel[grid](
-            image, target, blurred, scale, gradient, height, length, (1 - dssim_weight) / count, dssim_weight / count,
-            BYTES=target.dtype == torch.uint8, **tile,
+            image, target, blurred, scale, gradient, *size, (1 - dssim_weight) / count, dssim_weight / count,
+            BYTES=of_bytes, **tile,
         )  # fmt: skip
     return gradient

@@ -17,31 +17,29 @@ def load_screen(camera):
 
 
 @inline
-def copy_to(scratch, array, first, count):
-    """Copy some numbers, behind which there is room to read a whole vector."""
-    for k in range(count):
-        simd.put(scratch, k, simd.get(array, first + k))
-
-
-@inline
-def load3(array, start, count, scratch):
-    """16 rows of three; the last, incomplete vector is read from a copy."""
+def load_means(means, start, count, scratch):
+    """16 means; the last, incomplete vector is read from a padded copy."""
     if count < 16:
-        copy_to(scratch, array, 3 * start, 3 * count)
+        for k in range(3 * count):
+            simd.put(scratch, k, simd.get(means, 3 * start + k))
         return simd.load_rows3(scratch, 0)
-    return simd.load_rows3(array, 3 * start)
+    return simd.load_rows3(means, 3 * start)
 
 
 @inline
 def load_shapes(quats, scales, logits, start, count, scratch):
-    """16 quaternions, log scales and opacity logits, an incomplete vector as in :func:`load3`."""
-    scale = load3(scales, start, count, scratch)
+    """16 quaternions, log scales and opacity logits, an incomplete vector as in :func:`load_means`."""
     if count < 16:
-        copy_to(scratch, quats, 4 * start, 4 * count)
+        for k in range(4 * count):
+            simd.put(scratch, k, simd.get(quats, 4 * start + k))
         quat = simd.load_rows4(scratch, 0)
-        copy_to(scratch, logits, start, count)
+        for k in range(3 * count):
+            simd.put(scratch, k, simd.get(scales, 3 * start + k))
+        scale = simd.load_rows3(scratch, 0)
+        for k in range(count):
+            simd.put(scratch, k, simd.get(logits, start + k))
         return quat, scale, simd.load(scratch, 0)
-    return simd.load_rows4(quats, 4 * start), scale, simd.load(logits, start)
+    return simd.load_rows4(quats, 4 * start), simd.load_rows3(scales, 3 * start), simd.load(logits, start)
 
 
 @inline
@@ -52,7 +50,7 @@ def project_range(camera, antialiased, means, quats, scales, logits, first, last
     slots = 0
     for start in range(first, last, 16):
         count = min(16, last - start)
-        mean = load3(means, start, count, scratch)
+        mean = load_means(means, start, count, scratch)
         lanes = (1 << count) - 1
         view = rec.load_view(camera)
         point = view_point(view, mean)
