@@ -6,15 +6,13 @@ horizontal blur of those into a second ring buffer; another five rows later thei
 (the blur is its own adjoint). Only these rows are ever in memory.
 """
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
-from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat_checked, recycled
+from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat, flat_checked, recycled
 from nsvq_lightning.quality import formulas
 from nsvq_lightning.quality.ssim import SSIM_RADIUS, check_pair, ssim_window
 
@@ -143,45 +141,39 @@ def gradient_of_row(image, gradient, images, ring, y, length, pitch, l1_step, ss
     return simd.lane_sum(total)
 
 
-@inline
-def sweep(
-    image, target, white, gradient, first, last, height, length, pitch, l1_step, ssim_step, images, moments,
-    derivatives, ring, lanes, sums,
-):  # fmt: skip
-    """Process a band of rows; the sums of SSIM and absolute differences go to ``sums[2·y]`` and ``sums[2·y + 1]``."""
-    for y in range(first - 2 * SSIM_RADIUS, first):
-        take_row(image, target, white, images, y, height, length, pitch)
-    for y in range(first - SSIM_RADIUS, last + SSIM_RADIUS):
-        take_row(image, target, white, images, y + SSIM_RADIUS, height, length, pitch)
-        slot = row_of(y, DERIVATIVES, pitch)
-        if y < 0 or y >= height:
-            clear_row(ring, slot, DERIVATIVES * pitch)
-        else:
-            moments_of_row(images, y, length, pitch, moments)
-            similarity = similarity_of_row(moments, derivatives, length, pitch, lanes)
-            if y >= first and y < last:
-                sums[2 * y] = similarity
-            for plane in range(DERIVATIVES):
-                for x_ in range(0, length, 16):
-                    x = plane * pitch + PAD + min(x_, length - 16)
-                    simd.store(ring, slot + x, blur_along(derivatives, x))
-        done = y - SSIM_RADIUS
-        if done >= first:
-            apart = gradient_of_row(image, gradient, images, ring, done, length, pitch, l1_step, ssim_step, lanes)
-            sums[2 * done + 1] = apart
-
-
 @parallel
 def sweep_image(
     thread, threads, image, target, white, gradient, height, length, pitch, l1_step, ssim_step, images, moments,
     derivatives, ring, lanes, sums,
 ):  # fmt: skip
-    """Every thread sweeps a band of rows; a row's result does not depend on the band it is in."""
-    sweep(
-        image, target, white, gradient, height * thread // threads, height * (thread + 1) // threads, height,
-        length, pitch, l1_step, ssim_step, images[thread], moments[thread], derivatives[thread], ring[thread],
-        lanes, sums,
-    )  # fmt: skip
+    """Every thread sweeps a band of rows; a row's result does not depend on the band it is in.
+
+    The sums of SSIM and absolute differences go to ``sums[2·y]`` and ``sums[2·y + 1]``.
+    """
+    own_images, own_ring = images[thread], ring[thread]
+    own_moments, own_derivatives = moments[thread], derivatives[thread]
+    first, last = height * thread // threads, height * (thread + 1) // threads
+    for y in range(first - 2 * SSIM_RADIUS, first):
+        take_row(image, target, white, own_images, y, height, length, pitch)
+    for y in range(first - SSIM_RADIUS, last + SSIM_RADIUS):
+        take_row(image, target, white, own_images, y + SSIM_RADIUS, height, length, pitch)
+        slot = row_of(y, DERIVATIVES, pitch)
+        if y < 0 or y >= height:
+            clear_row(own_ring, slot, DERIVATIVES * pitch)
+        else:
+            moments_of_row(own_images, y, length, pitch, own_moments)
+            similarity = similarity_of_row(own_moments, own_derivatives, length, pitch, lanes)
+            if y >= first and y < last:
+                sums[2 * y] = similarity
+            for plane in range(DERIVATIVES):
+                for x_ in range(0, length, 16):
+                    x = plane * pitch + PAD + min(x_, length - 16)
+                    simd.store(own_ring, slot + x, blur_along(own_derivatives, x))
+        done = y - SSIM_RADIUS
+        if done >= first:
+            sums[2 * done + 1] = gradient_of_row(
+                image, gradient, own_images, own_ring, done, length, pitch, l1_step, ssim_step, lanes
+            )
 
 
 def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float) -> tuple[float, Tensor]:
@@ -201,22 +193,26 @@ def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float) -> tuple[float,
     length = 3 * width
     if length < simd.WIDTH:
         raise ValueError(f"a row of the image must fill a vector, so its width must be at least 6, got {width}")
-    kind = UINT8 if target.dtype == torch.uint8 else FLOAT32
-    pixels = flat_checked("image", image, tuple(image.shape)), flat_checked("target", target, tuple(target.shape), kind)
+    of_bytes = target.dtype == torch.uint8
+    shape = height, width, 3
+    pixels = flat_checked("image", image, shape)
+    wanted = flat_checked("target", target, shape, UINT8 if of_bytes else FLOAT32)
     pitch = (length + 2 * PAD + 15) // 16 * 16
     threads = max(1, min(thread_count(), height // RING))
-    gradient = recycled(tuple(image.shape))
+    gradient = recycled(shape)
     work = Workspace.borrow()
-    planes = {"images": RING * IMAGES, "moments": MOMENTS, "derivatives": DERIVATIVES, "ring": RING * DERIVATIVES}
-    rows: dict[str, Any] = {name: work.rows(name, threads, count * pitch) for name, count in planes.items()}
-    for padded in (rows["moments"], rows["derivatives"]):
-        padded.fill(0)
+    images = work.rows("images", threads, RING * IMAGES * pitch)
+    moments = work.rows("moments", threads, MOMENTS * pitch)
+    derivatives = work.rows("derivatives", threads, DERIVATIVES * pitch)
+    ring = work.rows("ring", threads, RING * DERIVATIVES * pitch)
+    moments.fill(0)
+    derivatives.fill(0)
     sums = work.array("row_sums", 2 * height, np.float64)
     count = length * height
-    white = F(255 if target.dtype == torch.uint8 else 1)
     sweep_image(
-        threads, *pixels, white, gradient.numpy().reshape(-1), height, length, pitch,
-        F((1 - dssim_weight) / count), F(dssim_weight / count), *rows.values(), np.arange(16, dtype=np.float32), sums,
+        threads, pixels, wanted, F(255 if of_bytes else 1), flat(gradient), height, length, pitch,
+        F((1 - dssim_weight) / count), F(dssim_weight / count), images, moments, derivatives, ring,
+        np.arange(16, dtype=np.float32), sums,
     )  # fmt: skip
     similarity, difference = sums[0::2].sum() / count, sums[1::2].sum() / count
     work.give_back()

@@ -33,9 +33,9 @@ def place(height, length, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
 
 
 @triton.jit
-def own_sums(sums):
-    """Where this program writes its two sums."""
-    return sums + 2 * (tl.program_id(0) * tl.num_programs(1) + tl.program_id(1))
+def program_number():
+    """Number of this program among all that work on a plane."""
+    return tl.program_id(0) * tl.num_programs(1) + tl.program_id(1)
 
 
 @triton.jit
@@ -91,7 +91,7 @@ def moments_kernel(
     at = place(height, length, ROWS, COLUMNS)
     p, q = pixels(image, target, at, 0, BYTES)
     # Beyond the border both are 0.
-    tl.store(own_sums(sums), tl.sum(tl.sum(tl.abs(p - q), 1), 0))
+    tl.store(sums + 2 * program_number(), tl.sum(tl.sum(tl.abs(p - q), 1), 0))
     blurred = formulas.moments(TAPS[0], p, q)
     for k in tl.static_range(1, RADIUS + 1):
         p, q = pixels(image, target, at, -k, BYTES)
@@ -125,13 +125,14 @@ def similarity_kernel(
 ):  # fmt: skip
     """Sum of SSIM into ``sums[2·program + 1]``; if ``DERIVED``, also its derivatives by blurred p, p² and p·q."""
     at = place(height, length, ROWS, COLUMNS)
+    program = program_number()  # first, which saves registers
     m1 = blur_along(moments, at)
     m2 = blur_along(plane_of(moments, 1, at), at)
     squares = blur_along(plane_of(moments, 2, at), at)
     product = blur_along(plane_of(moments, 3, at), at)
     similarity, by_mean, by_square, by_product = formulas.similarity(m1, m2, squares, product)
     _, inside = pointers(moments, at, 0, 0)
-    tl.store(own_sums(sums) + 1, tl.sum(tl.sum(tl.where(inside, similarity, 0.0), 1), 0))
+    tl.store(sums + 2 * program + 1, tl.sum(tl.sum(tl.where(inside, similarity, 0.0), 1), 0))
     if DERIVED:
         store_at(derivatives, at, by_mean)
         store_at(plane_of(derivatives, 1, at), at, by_square)
@@ -167,11 +168,12 @@ def gradient_kernel(
 ):  # fmt: skip
     """Gradient of ``scale`` times the loss, 0 where the image was clamped."""
     at = place(height, length, ROWS, COLUMNS)
+    squares, products = plane_of(blurred, 1, at), plane_of(blurred, 2, at)  # first, which saves registers
     raw = load_at(image, at, 0, 0)
     p, q = pixels(image, target, at, 0, BYTES)
     by_mean = blur_along(blurred, at)
-    by_square = blur_along(plane_of(blurred, 1, at), at)
-    by_product = blur_along(plane_of(blurred, 2, at), at)
+    by_square = blur_along(squares, at)
+    by_product = blur_along(products, at)
     value = formulas.pixel_gradient(raw, p, q, by_mean, by_square, by_product, l1_step, ssim_step)
     store_at(gradient, at, value * tl.load(scale))
 

@@ -2,14 +2,15 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import RotationSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
 from nsvq_lightning.rendering.camera import Camera, camera_of
@@ -46,8 +47,7 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
         raise ValueError("cameras of a path must have one size; reframe them first")
     positions, rotations = poses(cameras)
     unit = float(np.median(np.linalg.norm(positions - positions.mean(0), axis=1))) or 1.0
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1) / unit
-    steps += (rotations[:-1].inv() * rotations[1:]).magnitude() if len(cameras) > 1 else 0.0
+    steps = _steps(positions, rotations, unit)
     kept = np.concatenate([[True], steps > 1e-6])
     positions, rotations = positions[kept], rotations[kept]
     intrinsics = np.array([camera.intrinsics for camera in cameras])[kept]
@@ -57,10 +57,7 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     place = CubicSpline(at, positions, bc_type="natural")
     turn = RotationSpline(at, rotations)
     fine = np.linspace(0.0, at[-1], 16 * frames + 1)  # where the speed is measured
-    moved = np.linalg.norm(np.diff(place(fine), axis=0), axis=1) / unit
-    turned = turn(fine)
-    moved += (turned[:-1].inv() * turned[1:]).magnitude()
-    way = np.concatenate([[0.0], np.cumsum(moved)])
+    way = np.concatenate([[0.0], np.cumsum(_steps(place(fine), turn(fine), unit))])
     times = np.interp(np.linspace(0.0, way[-1], frames), way, fine)
     lenses = np.stack([np.interp(times, at, column) for column in intrinsics.T], axis=1)
     matrices = turn(times).as_matrix()
@@ -68,6 +65,12 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
         camera_of(view_from(matrix, position), tuple(lens), width, height, cameras[0].near)
         for matrix, position, lens in zip(matrices, place(times), lenses, strict=True)
     ]
+
+
+def _steps(positions: Float64s, rotations: Rotation, unit: float) -> Float64s:
+    """How far it is from each pose to the next, a turn by one radian counting as much as the distance ``unit``."""
+    turns = (rotations[:-1].inv() * rotations[1:]).magnitude() if len(positions) > 1 else 0.0
+    return np.asarray(np.linalg.norm(np.diff(positions, axis=0), axis=1) / unit + turns)
 
 
 def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -91,15 +94,17 @@ def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     across /= np.linalg.norm(across)
     ahead = np.cross(up, across)
     arms = positions - middle
-    height, radius = float(np.median(arms @ up)), float(np.median(np.hypot(arms @ across, arms @ ahead)))
-    start, arc = _arc(np.arctan2(arms @ ahead, arms @ across))
-    share = np.arange(frames) / frames
-    swing = 0.5 + 0.5 * np.sin(2 * math.pi * share)
-    angles = start + (2 * math.pi * share if arc >= math.radians(270) else arc * swing)
+    x, y = arms @ across, arms @ ahead
+    height = float(np.median(arms @ up))
+    radius = float(np.median(np.hypot(x, y)))
+    start, arc = _arc(np.arctan2(y, x))
+    turns = 2 * math.pi * (np.arange(frames) / frames)
+    if arc < math.radians(270):
+        turns = arc * (0.5 + 0.5 * np.sin(turns))
     lens = tuple(np.median([camera.intrinsics for camera in cameras], axis=0))
     first = cameras[0]
     path = []
-    for angle in angles:
+    for angle in start + turns:
         eye = middle + height * up + radius * (math.cos(angle) * across + math.sin(angle) * ahead)
         path.append(camera_of(view_towards(middle, eye, up), lens, first.width, first.height, first.near))
     return path
@@ -121,17 +126,25 @@ def read_camera_path(path: Path, width: int | None = None, height: int | None = 
         ValueError: It is not such a file, or has no size and none is given.
         OSError: It cannot be read.
     """
-    try:
+    with _refused(f"{path} is not a camera path as nerfstudio and the viewer write them"):
         content = json.loads(path.read_text(encoding="utf-8"))
         entries = content.get("camera_path") or content["keyframes"]
-        width, height = width or int(content["render_width"]), height or int(content["render_height"])
+        width = width or int(content["render_width"])
+        height = height or int(content["render_height"])
         cameras = [_entry_camera(entry, width, height) for entry in entries]
         if not cameras:
             raise ValueError("it has no cameras")
         return cameras, float(content.get("fps", 24))
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+
+
+@contextmanager
+def _refused(sentence: str, advice: str = "") -> Iterator[None]:
+    """Say with one sentence what else goes wrong where the content of a file is read, and why."""
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{path} is not a camera path as nerfstudio and the viewer write them: {reason}") from None
+        raise ValueError(f"{sentence} ({reason}){advice}") from None
 
 
 def _entry_camera(entry: Mapping[str, Any], width: int, height: int) -> Camera:
@@ -139,19 +152,20 @@ def _entry_camera(entry: Mapping[str, Any], width: int, height: int) -> Camera:
     pose = np.array(json.loads(numbers) if isinstance(numbers, str) else numbers, np.float64).reshape(4, 4)
     if np.abs(pose[3, :3]).max() > np.abs(pose[:3, 3]).max():
         pose = pose.T
-    rotation, field = pose[:3, :3], float(entry["fov"])
     if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
         raise ValueError("a pose is not a rigid matrix of 4x4")
+    field = float(entry["fov"])
     if not 0 < field < 180:
         raise ValueError(f"a field of view is {field} degrees")
     focal = 0.5 * height / math.tan(math.radians(field) / 2)
-    rotation = rotation * [1, -1, -1]  # from y up, looking along -z, to y down, looking along z
+    rotation = pose[:3, :3] * [1, -1, -1]  # from y up, looking along -z, to y down, looking along z
     return camera_of(_rigid_view(rotation, pose[:3, 3]), (focal, focal, width / 2, height / 2), width, height)
 
 
 # File beside a scene of INRIA's trainer, or two folders above it.
 CAMERAS = "cameras.json"
-_MOST_PIXELS = 1 << 16
+# Pixels of a picture's side.
+_MAX_SIDE = 1 << 16
 
 
 def read_cameras(path: Path) -> dict[str, Camera]:
@@ -166,37 +180,40 @@ def read_cameras(path: Path) -> dict[str, Camera]:
         OSError: It cannot be read.
     """
     cameras: dict[str, Camera] = {}
-    try:
+    advice = ": move it away, or name the photos with --data.root"
+    with _refused(f"{path} is no list of cameras as INRIA's trainer writes it", advice):
         for entry in json.loads(path.read_text(encoding="utf-8")):
-            rotation, position = (np.array(entry[key], np.float64) for key in ("rotation", "position"))
+            rotation = np.array(entry["rotation"], np.float64)
+            position = np.array(entry["position"], np.float64)
             width, height = int(entry["width"]), int(entry["height"])
-            if max(width, height) > _MOST_PIXELS:
+            if max(width, height) > _MAX_SIDE:
                 raise ValueError(f"a picture of {width}x{height}")
             lens = (entry["fx"], entry["fy"], width / 2, height / 2)
             name = str(entry["img_name"])
             if name in cameras:  # the names of photos in several folders, without these
                 name = f"{name} ({entry['id']})"
             cameras[name] = camera_of(_rigid_view(rotation, position), lens, width, height)
-    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        advice = "move it away, or name the photos with --data.root"
-        raise ValueError(f"{path} is no list of cameras as INRIA's trainer writes it ({reason}): {advice}") from None
     if not cameras:
         return {}
     near = Frame.around(poses(list(cameras.values()))[0]).near
     return {name: replace(camera, near=near) for name, camera in cameras.items()}
 
 
-# Coordinates that float32 holds with room to spare.
-_FAR = 1e30
+# Coordinates below this float32 holds with room to spare.
+_MAX_COORDINATE = 1e30
 
 
 def _rigid_view(rotation: Float64s, position: Float64s) -> Tensor:
     """:func:`~nsvq_lightning.rendering.poses.view_from` of numbers that may be anything."""
-    rigid = rotation.shape == (3, 3) and position.shape == (3,) and (np.abs(position) < _FAR).all()
-    if not rigid or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+    if not _is_rotation(rotation) or position.shape != (3,) or not (np.abs(position) < _MAX_COORDINATE).all():
         raise ValueError("a pose is not a rotation and a position")
     return view_from(rotation, position)
+
+
+def _is_rotation(matrix: Float64s) -> bool:
+    if matrix.shape != (3, 3) or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3):
+        return False
+    return bool(np.linalg.det(matrix) > 0)
 
 
 def _arc(angles: Float64s) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.rendering import formulas as shared
 from nsvq_lightning.rendering.cuda import records as rec
 from nsvq_lightning.rendering.cuda.binning import Tiles
-from nsvq_lightning.rendering.cuda.harmonics import load3
+from nsvq_lightning.rendering.cuda.harmonics import load3, store3
 from nsvq_lightning.rendering.cuda.projection import Lens
 
 formulas = for_triton(shared)
@@ -89,9 +89,10 @@ def blend_kernel(
             far += weight * tl.load(record + rec.DEPTH)
         i = tl.where(tl.max(t, 0) >= formulas.TRANSMITTANCE_MIN, looked, end)
     tl.store(ends + tile, looked)
-    tl.store(image + 3 * pixel, red + kept * tl.load(background), mask=inside)
-    tl.store(image + 3 * pixel + 1, green + kept * tl.load(background + 1), mask=inside)
-    tl.store(image + 3 * pixel + 2, blue + kept * tl.load(background + 2), mask=inside)
+    red += kept * tl.load(background)
+    green += kept * tl.load(background + 1)
+    blue += kept * tl.load(background + 2)
+    store3(image + 3 * pixel, (red, green, blue), inside)
     tl.store(transmittance + pixel, kept, mask=inside)
     tl.store(depth + pixel, far, mask=inside)
 
@@ -104,12 +105,9 @@ def blend_backward_kernel(
     """Write the sums of every splat of a tile to its slot."""
     tile = tl.load(order + tl.program_id(0))
     left, top, x, y, pixel, inside = tile_pixels(tile, columns, width, height)
-    g_red = tl.load(g_image + 3 * pixel, mask=inside, other=0.0)
-    g_green = tl.load(g_image + 3 * pixel + 1, mask=inside, other=0.0)
-    g_blue = tl.load(g_image + 3 * pixel + 2, mask=inside, other=0.0)
-    rest = g_red * tl.load(image + 3 * pixel, mask=inside, other=0.0)
-    rest += g_green * tl.load(image + 3 * pixel + 1, mask=inside, other=0.0)
-    rest += g_blue * tl.load(image + 3 * pixel + 2, mask=inside, other=0.0)
+    g_red, g_green, g_blue = load3(g_image + 3 * pixel, inside)
+    red, green, blue = load3(image + 3 * pixel, inside)
+    rest = g_red * red + g_green * green + g_blue * blue
     if WITH_ALPHA:
         # Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end.
         kept = tl.load(transmittance + pixel, mask=inside, other=0.0)
@@ -189,15 +187,14 @@ def total_kernel(
     tl.store(totals + rank[:, None] * rec.RECORD + lane, total, mask=seen[:, None] & (lane < rec.FIELDS))
     u, v = field_of(total, rec.SUM_U), field_of(total, rec.SUM_V)
     record = records + rank * rec.RECORD
-    a, b = tl.load(record + rec.A, mask=seen, other=0.0), tl.load(record + rec.B, mask=seen, other=0.0)
-    c = tl.load(record + rec.C, mask=seen, other=0.0)
+    a, b, c = load3(record + rec.A, seen)
     row = tl.load(ids + rank, mask=seen, other=0)
     tl.store(g_means2d + 2 * row, a * u * formulas.TWO_LN2, mask=seen)
     tl.store(g_means2d + 2 * row + 1, (b * u + c * v) * formulas.TWO_LN2, mask=seen)
     if WITH_ABSGRAD:
-        tl.store(absgrad + 3 * row, tl.abs(a) * field_of(total, rec.ABS_X) * formulas.TWO_LN2, mask=seen)
-        tl.store(absgrad + 3 * row + 1, field_of(total, rec.ABS_Y) * formulas.TWO_LN2, mask=seen)
-        tl.store(absgrad + 3 * row + 2, field_of(total, rec.SUM_WEIGHT), mask=seen)
+        x = tl.abs(a) * field_of(total, rec.ABS_X) * formulas.TWO_LN2
+        y = field_of(total, rec.ABS_Y) * formulas.TWO_LN2
+        store3(absgrad + 3 * row, (x, y, field_of(total, rec.SUM_WEIGHT)), seen)
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:

@@ -76,18 +76,16 @@ def project_kernel(
         x0, y0 = tl.where(seen, first[0], 0.0).to(tl.int32), tl.where(seen, first[1], 0.0).to(tl.int32)
         x1, y1 = tl.where(seen, last[0], 0.0).to(tl.int32), tl.where(seen, last[1], 0.0).to(tl.int32)
         box = boxes + 4 * row
-        tl.store(box, x0, mask=seen)
-        tl.store(box + 1, y0, mask=seen)
-        tl.store(box + 2, x1 - x0 + 1, mask=seen)
+        store3(box, (x0, y0, x1 - x0 + 1), seen)
         tl.store(box + 3, y1 - y0 + 1, mask=seen)
         d, _ = formulas.unit_direction(row_of(view, 4), mean)
-        red, green, blue = formulas.clamped(color(sh0, shN, row, row * stride, d, seen, DEGREE))
+        rgb = formulas.clamped(color(sh0 + 3 * row, shN + row * stride, d, seen, DEGREE))
         at = records + row * rec.RECORD
         tl.store(at + rec.X, px, mask=seen)
         tl.store(at + rec.Y, py, mask=seen)
-        store3(at + rec.A, a, b, c, seen)
+        store3(at + rec.A, (a, b, c), seen)
         tl.store(at + rec.LOG2_OPACITY, log2_opacity, mask=seen)
-        store3(at + rec.RED, red, green, blue, seen)
+        store3(at + rec.RED, rgb, seen)
         tl.store(at + rec.DEPTH, z, mask=seen)
 
 
@@ -117,17 +115,18 @@ def project_backward_kernel(
         load3(total + rec.SUM_UU, seen), h, (g2x, g2y), tl.load(total + rec.SUM_DEPTH, mask=seen, other=0.0),
         ANTIALIASED,
     )  # fmt: skip
-    store3(g_scales + 3 * row, g_scale[0], g_scale[1], g_scale[2], inside)
-    tl.store(g_quats + 4 * row, g_quat[0], mask=inside)
-    store3(g_quats + 4 * row + 1, g_quat[1], g_quat[2], g_quat[3], inside)
+    g_w, g_x, g_y, g_z = g_quat
+    store3(g_scales + 3 * row, g_scale, inside)
+    tl.store(g_quats + 4 * row, g_w, mask=inside)
+    store3(g_quats + 4 * row + 1, (g_x, g_y, g_z), inside)
 
     rgb = formulas.unclamped(load3(record + rec.RED, seen), load3(total + rec.SUM_RED, seen))
     d, d_inverse = formulas.unit_direction(row_of(view, 4), mean)
-    g = color_backward(g_sh0, g_shN, shN, row, row * STRIDE, d, rgb, seen, inside, DEGREE)
+    g_row = g_shN + row * STRIDE
+    g_d = color_backward(g_sh0 + 3 * row, (shN + row * STRIDE, g_row), d, rgb, (seen, inside), DEGREE)
     for k in range(3 * (DEGREE + 1) * (DEGREE + 1) - 3, STRIDE):  # of the bands that are not evaluated
-        tl.store(g_shN + row * STRIDE + k, 0.0, mask=inside)
-    g = formulas.mean_gradient(d, d_inverse, g)
-    store3(g_means + 3 * row, g_mean[0] + g[0], g_mean[1] + g[1], g_mean[2] + g[2], inside)
+        tl.store(g_row + k, 0.0, mask=inside)
+    store3(g_means + 3 * row, formulas.add3(g_mean, formulas.mean_gradient(d, d_inverse, g_d)), inside)
     logit = tl.load(logits + row, mask=seen, other=0.0)
     tl.store(g_logits + row, formulas.logit_gradient(logit, h), mask=inside)
 
