@@ -40,8 +40,10 @@ def similarity(m1, m2, squares, product):
     means = simd.fma(m1, m1, m2 * m2)
     variances = squares - means
     covariance = product - m12
-    a, d = simd.fma(2.0, m12, C1), simd.fma(2.0, covariance, C2)
-    e, f = means + C1, variances + C2
+    a = simd.fma(2.0, m12, C1)
+    d = simd.fma(2.0, covariance, C2)
+    e = means + C1
+    f = variances + C2
     ef = 1 / (e * f)
     e, f = f * ef, e * ef
     value = a * d * ef

@@ -27,13 +27,15 @@ def color_corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) ->
     Returns:
         ``[H, W, 3]`` in [0, 1], of the image's dtype.
     """
-    colors, target = image.reshape(-1, 3).double(), photo.reshape(-1, 3).double()
+    colors = image.reshape(-1, 3).double()
+    target = photo.reshape(-1, 3).double()
     counting = torch.ones_like(colors[:, 0], dtype=torch.bool) if mask is None else mask.reshape(-1)
     dark, bright = 0.5 / 255, 1 - 0.5 / 255  # beyond these, a pixel is clipped and says nothing about the map
     seen = counting[:, None] & (target >= dark) & (target <= bright)
     parts = [slice(start, start + AT_ONCE) for start in range(0, len(colors), AT_ONCE)]
     for _ in range(5):
-        normal, moment = colors.new_zeros(3, TERMS, TERMS), colors.new_zeros(3, TERMS)
+        normal = colors.new_zeros(3, TERMS, TERMS)
+        moment = colors.new_zeros(3, TERMS)
         for part in parts:
             terms = _terms(colors[part])
             unclipped = seen[part] & (colors[part] >= dark) & (colors[part] <= bright)

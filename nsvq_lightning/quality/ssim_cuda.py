@@ -142,7 +142,8 @@ def similarity_kernel(
 @triton.jit
 def loss_kernel(sums, loss, programs, count, dssim_weight, BLOCK: tl.constexpr):
     """Add up the sums of all programs, in float64: (1 - w)·Σ|p - q|/n + w·(1 - ΣSSIM/n)."""
-    difference, similarity = tl.zeros([BLOCK], tl.float64), tl.zeros([BLOCK], tl.float64)
+    difference = tl.zeros([BLOCK], tl.float64)
+    similarity = tl.zeros([BLOCK], tl.float64)
     for start in range(0, programs, BLOCK):
         program = start + tl.arange(0, BLOCK)
         difference += tl.load(sums + 2 * program, mask=program < programs, other=0.0).to(tl.float64)
