@@ -78,7 +78,6 @@ def render(
     elif tuple(background.shape) != (3,):
         raise ValueError(f"background must be one RGB colour of shape [3], got {list(background.shape)}")
     background = background.to(means)
-    module = _module_of(backend, means)
     absgrad = None
     if pixel_weights is not None:
         if tuple(pixel_weights.shape) != (camera.height, camera.width):
@@ -86,7 +85,8 @@ def render(
             raise ValueError(f"pixel_weights must be {expected}, got {list(pixel_weights.shape)}")
         absgrad = means.new_zeros(means.shape[0], 3).requires_grad_()
         pixel_weights = pixel_weights.detach().to(means).contiguous()
-    image, alpha, radii, means2d, depth = module.render(
+    # None for False: kernels without anti-aliasing are compiled without its code.
+    image, alpha, radii, means2d, depth = _module_of(backend, means).render(
         splats, camera, degree, background, pixel_weights, absgrad, antialiased or None
     )
     return Render(image, alpha, radii, means2d, depth, absgrad)

@@ -30,7 +30,7 @@ def project_backward(
     """Gradients of all raw attributes from the sums of the slots of the visible splats; 0 for the others.
 
     ``sums[16·slot]`` of a splat's first slot holds its total; ``g_means2d [N·2]`` the gradient of its projected centre.
-    ``geometry`` are means, quaternions, log-scales and logits, ``bands`` as in :func:`finish_records`.
+    ``geometry`` are means, quaternions, log-scales and logits, ``bands`` as in ``add_colors``.
     """
     means, quats, scales, logits = geometry
     g_means, g_quats, g_scales, g_logits, g_sh0, g_shN = gradients
