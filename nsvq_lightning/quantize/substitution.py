@@ -23,7 +23,6 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import INT64, Array, flat_checked, outside, recycled
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside
-from nsvq_lightning.quantize.scores import squares
 
 
 @inline
@@ -74,12 +73,10 @@ def fill_normal(seed, first, count, out, radius, angle):
 
 
 @inline
-def _copy_in(dim, source, rows, first, count, group):
-    """Copy chosen rows into vectors, one row per lane."""
-    for lane in range(count):
-        start = simd.get(rows, first + lane) * dim
-        for j in range(dim):
-            simd.put(group, j * 16 + lane, simd.get(source, start + j))
+def _take_row(dim, source, start, lane, group):
+    """Copy a row into one lane of vectors."""
+    for j in range(dim):
+        simd.put(group, j * 16 + lane, simd.get(source, start + j))
 
 
 @inline
@@ -96,164 +93,164 @@ def _inverses(squared):
 
 
 @inline
-def _dot_difference(dim, g, at_g, a, at_a, b, at_b, keep):
-    """Dot product of a long row with a difference. ``keep`` masks the overlap of the last two vectors."""
-    total = simd.broadcast(0)
-    for j in range(0, dim // 16 * 16, 16):
-        total = simd.fma(simd.load(g, at_g + j), simd.load(a, at_a + j) - simd.load(b, at_b + j), total)
-    if dim % 16:
-        difference = simd.load(a, at_a + dim - 16) - simd.load(b, at_b + dim - 16)
-        total = simd.fma(simd.load(g, at_g + dim - 16) * simd.load(keep, 0), difference, total)
-    return simd.lane_sum(total)
-
-
-@inline
 def _inverse(squared):
     return F(1.0) / squared if squared > _TINY else F(0.0)
 
 
-def _short_forward(dim: int) -> Any:
-    def forward(block, _, seed, aim, spread, x, rows, codebook, codes, out):
-        count = codes.shape[0]
-        begin, stop = block * _ROWS, min(count, (block + 1) * _ROWS)
-        found = _outside(dim, x, rows, codebook, codes, begin, stop)
-        noise, radius, angle = np.empty(_ROWS * dim, np.float32), np.empty(16, np.float32), np.empty(16, np.float32)
-        values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
-        fill_normal(seed, begin // 16 * dim, _ROWS // 16 * dim, noise, radius, angle)
-        for first in range(begin, stop if found == 0 else begin, 16):
-            valid = min(16, count - first)
-            _copy_in(dim, x, rows, first, valid, values)
-            _copy_in(dim, codebook, codes, first, valid, chosen)
-            at = (first - begin) * dim
-            error, squared = simd.broadcast(0), simd.broadcast(0)
+@inline
+def _new_lanes(dim):
+    """1 in the lanes of a row's last vector that the one before does not cover."""
+    keep = np.ones(16, np.float32)
+    keep[: -dim % 16] = 0
+    return keep
+
+
+@inline
+def _short_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, stop):
+    noise = np.empty(_ROWS * dim, np.float32)
+    radius, angle = np.empty(16, np.float32), np.empty(16, np.float32)
+    values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
+    fill_normal(seed, begin // 16 * dim, _ROWS // 16 * dim, noise, radius, angle)
+    for first in range(begin, stop, 16):
+        valid = min(16, stop - first)
+        for lane in range(valid):
+            _take_row(dim, x, simd.get(rows, first + lane) * dim, lane, values)
+            _take_row(dim, codebook, simd.get(codes, first + lane) * dim, lane, chosen)
+        at = (first - begin) * dim
+        error, squared = simd.broadcast(0), simd.broadcast(0)
+        for j in range(dim):
+            residual = simd.load(chosen, 16 * j) - simd.load(values, 16 * j)
+            direction = simd.fma(aim, residual, spread * simd.load(noise, at + 16 * j))
+            simd.store(noise, at + 16 * j, direction)
+            error = simd.fma(residual, residual, error)
+            squared = simd.fma(direction, direction, squared)
+        length = simd.sqrt(error * _inverses(squared))
+        for j in range(dim):
+            simd.store(values, 16 * j, simd.fma(length, simd.load(noise, at + 16 * j), simd.load(values, 16 * j)))
+        for lane in range(valid):
             for j in range(dim):
-                residual = simd.load(chosen, 16 * j) - simd.load(values, 16 * j)
-                direction = simd.fma(aim, residual, spread * simd.load(noise, at + 16 * j))
-                simd.store(noise, at + 16 * j, direction)
-                error, squared = simd.fma(residual, residual, error), simd.fma(direction, direction, squared)
-            length = simd.sqrt(error * _inverses(squared))
-            for j in range(dim):
-                simd.store(values, 16 * j, simd.fma(length, simd.load(noise, at + 16 * j), simd.load(values, 16 * j)))
-            for lane in range(valid):
-                for j in range(dim):
-                    simd.put(out, (first + lane) * dim + j, simd.get(values, j * 16 + lane))
-        return found
-
-    return parallel(forward)
+                simd.put(out, (first + lane) * dim + j, simd.get(values, j * 16 + lane))
 
 
-def _long_forward(dim: int) -> Any:
-    vectors = -(-dim // 16)
-
-    def forward(block, _, seed, aim, spread, x, rows, codebook, codes, out):
-        count = codes.shape[0]
-        begin, stop = block * _ROWS, min(count, (block + 1) * _ROWS)
-        found = _outside(dim, x, rows, codebook, codes, begin, stop)
-        radius, angle, keep = np.empty(16, np.float32), np.empty(16, np.float32), np.ones(16, np.float32)
-        keep[: vectors * 16 - dim] = 0
-        noise, direction = np.empty(2 * vectors * 16, np.float32), np.empty(vectors * 16, np.float32)
-        for i in range(begin, stop if found == 0 else begin):
-            start = i % 2 * vectors * 16
-            if start == 0:
-                fill_normal(seed, i * vectors, 2 * vectors, noise, radius, angle)
-            at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
-            error, squared = simd.broadcast(0), simd.broadcast(0)
-            for j in range(vectors):
-                place = min(16 * j, dim - 16)
-                residual = simd.load(codebook, code + place) - simd.load(x, at + place)
-                way = simd.fma(aim, residual, spread * simd.load(noise, start + place))
-                simd.store(direction, place, way)
-                if j == vectors - 1:
-                    residual, way = residual * simd.load(keep, 0), way * simd.load(keep, 0)
-                error, squared = simd.fma(residual, residual, error), simd.fma(way, way, squared)
-            length = np.sqrt(simd.lane_sum(error) * _inverse(simd.lane_sum(squared)))
-            for j in range(vectors):
-                place = min(16 * j, dim - 16)
-                simd.store(
-                    out, i * dim + place, simd.fma(length, simd.load(direction, place), simd.load(x, at + place))
-                )
-        return found
-
-    return parallel(forward)
-
-
-def _short_backward(dim: int) -> Any:
-    def backward(part, parts, grad, x, rows, codebook, codes, out, grad_x, sums):
-        count = codes.shape[0]
-        values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
-        moved, slope = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
-        total = sums[part]
-        clear(total, 0, total.shape[0])
-        begin, stop = count * part // parts, count * (part + 1) // parts
-        found = _outside(dim, x, rows, codebook, codes, begin, stop)
-        for first in range(begin, stop if found == 0 else begin, 16):
-            valid = min(16, stop - first)
-            _copy_in(dim, x, rows, first, valid, values)
-            _copy_in(dim, codebook, codes, first, valid, chosen)
-            for lane in range(valid):
-                for j in range(dim):
-                    simd.put(moved, j * 16 + lane, simd.get(out, (first + lane) * dim + j))
-                    simd.put(slope, j * 16 + lane, simd.get(grad, (first + lane) * dim + j))
-            dots, squared = simd.broadcast(0), simd.broadcast(0)
-            for j in range(dim):
-                value = simd.load(values, 16 * j)
-                dots = simd.fma(simd.load(slope, 16 * j), simd.load(moved, 16 * j) - value, dots)
-                residual = value - simd.load(chosen, 16 * j)
-                squared = simd.fma(residual, residual, squared)
-            scale = dots * _inverses(squared)
-            for j in range(dim):
-                radial = scale * (simd.load(values, 16 * j) - simd.load(chosen, 16 * j))
-                simd.store(chosen, 16 * j, radial)
-                simd.store(slope, 16 * j, simd.load(slope, 16 * j) + radial)
-            for lane in range(valid):
-                i = first + lane
-                clear_between(rows, i, dim, grad_x)
-                at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
-                for j in range(dim):
-                    simd.put(grad_x, at + j, simd.get(slope, j * 16 + lane))
-                    simd.put(total, code + j, simd.get(total, code + j) - simd.get(chosen, j * 16 + lane))
-        if part == parts - 1 and found == 0:
-            clear_between(rows, count, dim, grad_x)
-        return found
-
-    return parallel(backward)
-
-
-def _long_backward(dim: int) -> Any:
-    vectors = -(-dim // 16)
-
-    def backward(part, parts, grad, x, rows, codebook, codes, out, grad_x, sums):
-        count = codes.shape[0]
-        keep = np.ones(16, np.float32)
-        keep[: vectors * 16 - dim] = 0
-        total = sums[part]
-        clear(total, 0, total.shape[0])
-        begin, stop = count * part // parts, count * (part + 1) // parts
-        found = _outside(dim, x, rows, codebook, codes, begin, stop)
-        for i in range(begin, stop if found == 0 else begin):
-            at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
-            scale = _dot_difference(dim, grad, i * dim, out, i * dim, x, at, keep)
-            scale *= _inverse(simd.lane_sum(squares(dim, x, at, codebook, code, keep)))
-            clear_between(rows, i, dim, grad_x)
-            # The last two vectors overlap, so the last sums are read before any are written.
-            last = simd.load(total, code + dim - 16)
-            for j in range(vectors):
-                place = min(16 * j, dim - 16)
-                radial = scale * (simd.load(x, at + place) - simd.load(codebook, code + place))
-                simd.store(grad_x, at + place, simd.load(grad, i * dim + place) + radial)
-                before = last if j == vectors - 1 else simd.load(total, code + place)
-                simd.store(total, code + place, before - radial)
-        if part == parts - 1 and found == 0:
-            clear_between(rows, count, dim, grad_x)
-        return found
-
-    return parallel(backward)
+@inline
+def _long_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, stop):
+    vectors = (dim + 15) // 16
+    keep = _new_lanes(dim)
+    radius, angle = np.empty(16, np.float32), np.empty(16, np.float32)
+    noise, direction = np.empty(2 * vectors * 16, np.float32), np.empty(vectors * 16, np.float32)
+    for i in range(begin, stop):
+        start = i % 2 * vectors * 16
+        if start == 0:
+            fill_normal(seed, i * vectors, 2 * vectors, noise, radius, angle)
+        at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
+        error, squared = simd.broadcast(0), simd.broadcast(0)
+        for j in range(vectors):
+            place = min(16 * j, dim - 16)
+            residual = simd.load(codebook, code + place) - simd.load(x, at + place)
+            way = simd.fma(aim, residual, spread * simd.load(noise, start + place))
+            simd.store(direction, place, way)
+            if j == vectors - 1:
+                residual, way = residual * simd.load(keep, 0), way * simd.load(keep, 0)
+            error = simd.fma(residual, residual, error)
+            squared = simd.fma(way, way, squared)
+        length = np.sqrt(simd.lane_sum(error) * _inverse(simd.lane_sum(squared)))
+        for j in range(vectors):
+            place = min(16 * j, dim - 16)
+            moved = simd.fma(length, simd.load(direction, place), simd.load(x, at + place))
+            simd.store(out, i * dim + place, moved)
 
 
 @cache
-def _kernels(dim: int) -> tuple[Any, Any]:
-    """Forward and backward for rows of ``dim`` columns, a compile-time constant."""
-    return (_short_forward(dim), _short_backward(dim)) if dim < 16 else (_long_forward(dim), _long_backward(dim))
+def _forward(dim: int) -> Any:
+    """The kernel for rows of ``dim`` columns, a compile-time constant."""
+    write_rows = _short_forward if dim < 16 else _long_forward
+
+    def forward(block, _, seed, aim, spread, x, rows, codebook, codes, out):
+        begin, stop = block * _ROWS, min(codes.shape[0], (block + 1) * _ROWS)
+        found = _outside(dim, x, rows, codebook, codes, begin, stop)
+        if found == 0:
+            write_rows(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, stop)
+        return found
+
+    return parallel(forward)
+
+
+@inline
+def _short_backward(dim, grad, x, rows, codebook, codes, out, grad_x, sums, begin, stop):
+    values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
+    moved, slope = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
+    for first in range(begin, stop, 16):
+        valid = min(16, stop - first)
+        for lane in range(valid):
+            i = first + lane
+            _take_row(dim, x, simd.get(rows, i) * dim, lane, values)
+            _take_row(dim, codebook, simd.get(codes, i) * dim, lane, chosen)
+            _take_row(dim, out, i * dim, lane, moved)
+            _take_row(dim, grad, i * dim, lane, slope)
+        dots, squared = simd.broadcast(0), simd.broadcast(0)
+        for j in range(dim):
+            value = simd.load(values, 16 * j)
+            dots = simd.fma(simd.load(slope, 16 * j), simd.load(moved, 16 * j) - value, dots)
+            residual = value - simd.load(chosen, 16 * j)
+            squared = simd.fma(residual, residual, squared)
+        scale = dots * _inverses(squared)
+        for j in range(dim):
+            radial = scale * (simd.load(values, 16 * j) - simd.load(chosen, 16 * j))
+            simd.store(chosen, 16 * j, radial)
+            simd.store(slope, 16 * j, simd.load(slope, 16 * j) + radial)
+        for lane in range(valid):
+            i = first + lane
+            clear_between(rows, i, dim, grad_x)
+            at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
+            for j in range(dim):
+                simd.put(grad_x, at + j, simd.get(slope, j * 16 + lane))
+                simd.put(sums, code + j, simd.get(sums, code + j) - simd.get(chosen, j * 16 + lane))
+
+
+@inline
+def _long_backward(dim, grad, x, rows, codebook, codes, out, grad_x, sums, begin, stop):
+    vectors = (dim + 15) // 16
+    keep = _new_lanes(dim)
+    for i in range(begin, stop):
+        at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
+        dots, squared = simd.broadcast(0), simd.broadcast(0)
+        for j in range(vectors):
+            place = min(16 * j, dim - 16)
+            value, slope = simd.load(x, at + place), simd.load(grad, i * dim + place)
+            residual = value - simd.load(codebook, code + place)
+            if j == vectors - 1:
+                residual, slope = residual * simd.load(keep, 0), slope * simd.load(keep, 0)
+            dots = simd.fma(slope, simd.load(out, i * dim + place) - value, dots)
+            squared = simd.fma(residual, residual, squared)
+        scale = simd.lane_sum(dots) * _inverse(simd.lane_sum(squared))
+        clear_between(rows, i, dim, grad_x)
+        # The last two vectors overlap, so the last sums are read before any are written.
+        last = simd.load(sums, code + dim - 16)
+        for j in range(vectors):
+            place = min(16 * j, dim - 16)
+            radial = scale * (simd.load(x, at + place) - simd.load(codebook, code + place))
+            simd.store(grad_x, at + place, simd.load(grad, i * dim + place) + radial)
+            before = last if j == vectors - 1 else simd.load(sums, code + place)
+            simd.store(sums, code + place, before - radial)
+
+
+@cache
+def _backward(dim: int) -> Any:
+    """The kernel of the gradients; each part of the rows has its own sums."""
+    write_rows = _short_backward if dim < 16 else _long_backward
+
+    def backward(part, parts, grad, x, rows, codebook, codes, out, grad_x, sums):
+        count = codes.shape[0]
+        begin, stop = count * part // parts, count * (part + 1) // parts
+        found = _outside(dim, x, rows, codebook, codes, begin, stop)
+        if found == 0:
+            clear(sums[part], 0, sums.shape[1])
+            write_rows(dim, grad, x, rows, codebook, codes, out, grad_x, sums[part], begin, stop)
+            if part == parts - 1:
+                clear_between(rows, count, dim, grad_x)
+        return found
+
+    return parallel(backward)
 
 
 def substitute(
@@ -277,8 +274,8 @@ def substitute(
     inputs = _checked(x, rows, codebook, codes)
     out = recycled((len(rows), x.shape[1]))
     thread_count()
-    blocks, chosen = -(-len(rows) // _ROWS), (seed, F(aim), F(spread))
-    if _kernels(x.shape[1])[0](blocks, *chosen, *inputs, out.numpy().reshape(-1)):
+    blocks = -(-len(rows) // _ROWS)
+    if _forward(x.shape[1])(blocks, seed, F(aim), F(spread), *inputs, out.numpy().reshape(-1)):
         raise _missing(x, rows, codebook, codes)
     return out
 
@@ -319,7 +316,7 @@ def substitute_backward(
     parts = max(4, min(64, len(rows) // (4 * len(codebook))))
     sums = recycled((parts, codebook.numel())).numpy()
     thread_count()
-    if _kernels(x.shape[1])[1](parts, slope, *inputs, moved, grad_x.numpy().reshape(-1), sums):
+    if _backward(x.shape[1])(parts, slope, *inputs, moved, grad_x.numpy().reshape(-1), sums):
         raise _missing(x, rows, codebook, codes)
     np.add.reduce(sums, axis=0, out=grad_codebook.numpy().reshape(-1))
     return grad_x, grad_codebook
