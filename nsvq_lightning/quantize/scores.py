@@ -64,6 +64,15 @@ def true_distance(dim, x, row, codebook, code):
 
 
 @inline
+def closer(dim, x, row, codebook, code, distance, candidate):
+    """The nearer of a code at ``distance`` and a candidate, and its distance; of equally near ones the lower."""
+    candidate_distance = true_distance(dim, x, row, codebook, candidate)
+    if candidate_distance < distance or (candidate_distance == distance and candidate < code):
+        return candidate, candidate_distance
+    return code, distance
+
+
+@inline
 def squares(dim, a, at_a, b, at_b, keep):
     """Squared differences of two rows, to be summed. ``keep`` masks the overlap of the last two vectors."""
     total = simd.broadcast(0)
@@ -85,7 +94,7 @@ def squares(dim, a, at_a, b, at_b, keep):
 LIST = 8
 
 _BEST = LIST + 1  # scores that a row keeps: those of a list, and the smallest of a code outside it
-_FEW = 4  # scores that a row keeps where no list is requested
+_BEST_ALONE = 4  # scores that a row keeps where no list is requested
 _GROUP = 6  # rows scored together
 _TILE = 8 * _GROUP  # rows that pass over a chunk of codes while it stays in the L1 cache
 _CHUNK = 4  # blocks of 32 codes in a chunk
@@ -121,36 +130,39 @@ def _keep(scores, codes, limits, slack, kept, first, block, found):
 
 
 @inline
+def _subtract(sums, value, low, high):
+    return simd.fnma(value, low, sums[0]), simd.fnma(value, high, sums[1])
+
+
+@inline
+def _below(sums, limits, row):
+    return simd.minimum(sums[0], sums[1]) < simd.get(limits, row)
+
+
+@inline
 def _score_block(dim, blocks, halves, block, rows, first, kept, state):
     """Scores of 6 rows against 32 codes: 12 sums that hide each other's latency."""
     scores, codes, limits, slack, found = state
-    a0 = a1 = a2 = a3 = a4 = a5 = simd.load(halves, block * 32)
-    b0 = b1 = b2 = b3 = b4 = b5 = simd.load(halves, block * 32 + 16)
-    at, row = block * dim * 32, first * dim
+    s0 = s1 = s2 = s3 = s4 = s5 = simd.load(halves, block * 32), simd.load(halves, block * 32 + 16)
     for j in range(dim):
-        low, high = simd.load(blocks, at + 32 * j), simd.load(blocks, at + 32 * j + 16)
-        value = simd.get(rows, row + j)
-        a0, b0 = simd.fnma(value, low, a0), simd.fnma(value, high, b0)
-        value = simd.get(rows, row + dim + j)
-        a1, b1 = simd.fnma(value, low, a1), simd.fnma(value, high, b1)
-        value = simd.get(rows, row + 2 * dim + j)
-        a2, b2 = simd.fnma(value, low, a2), simd.fnma(value, high, b2)
-        value = simd.get(rows, row + 3 * dim + j)
-        a3, b3 = simd.fnma(value, low, a3), simd.fnma(value, high, b3)
-        value = simd.get(rows, row + 4 * dim + j)
-        a4, b4 = simd.fnma(value, low, a4), simd.fnma(value, high, b4)
-        value = simd.get(rows, row + 5 * dim + j)
-        a5, b5 = simd.fnma(value, low, a5), simd.fnma(value, high, b5)
+        at, row = (block * dim + j) * 32, first * dim + j
+        low, high = simd.load(blocks, at), simd.load(blocks, at + 16)
+        s0 = _subtract(s0, simd.get(rows, row), low, high)
+        s1 = _subtract(s1, simd.get(rows, row + dim), low, high)
+        s2 = _subtract(s2, simd.get(rows, row + 2 * dim), low, high)
+        s3 = _subtract(s3, simd.get(rows, row + 3 * dim), low, high)
+        s4 = _subtract(s4, simd.get(rows, row + 4 * dim), low, high)
+        s5 = _subtract(s5, simd.get(rows, row + 5 * dim), low, high)
     below = (
-        (simd.minimum(a0, b0) < simd.get(limits, first))
-        | (simd.minimum(a1, b1) < simd.get(limits, first + 1))
-        | (simd.minimum(a2, b2) < simd.get(limits, first + 2))
-        | (simd.minimum(a3, b3) < simd.get(limits, first + 3))
-        | (simd.minimum(a4, b4) < simd.get(limits, first + 4))
-        | (simd.minimum(a5, b5) < simd.get(limits, first + 5))
+        _below(s0, limits, first)
+        | _below(s1, limits, first + 1)
+        | _below(s2, limits, first + 2)
+        | _below(s3, limits, first + 3)
+        | _below(s4, limits, first + 4)
+        | _below(s5, limits, first + 5)
     )
     if simd.mask_bits(below) != 0:
-        sums = a0, b0, a1, b1, a2, b2, a3, b3, a4, b4, a5, b5
+        sums = s0 + s1 + s2 + s3 + s4 + s5
         for k in range(12):
             simd.store(found, 16 * k, sums[k])
         _keep(scores, codes, limits, slack, kept, first, block, found)
@@ -180,10 +192,7 @@ def _settle(dim, x, row, codebook, scores, codes, at, kept, limit):
     distance = F(np.inf)
     for place in range(at, at + kept):
         if simd.get(scores, place) <= limit:
-            candidate = np.int64(simd.get(codes, place))
-            candidate_distance = true_distance(dim, x, row, codebook, candidate)
-            if candidate_distance < distance or (candidate_distance == distance and candidate < code):
-                code, distance = candidate, candidate_distance
+            code, distance = closer(dim, x, row, codebook, code, distance, np.int64(simd.get(codes, place)))
     return code
 
 
@@ -191,10 +200,14 @@ def _settle(dim, x, row, codebook, scores, codes, at, kept, limit):
 def _compare_all(dim, x, row, codebook):
     code, distance = 0, F(np.inf)
     for candidate in range(codebook.shape[0] // dim):
-        candidate_distance = true_distance(dim, x, row, codebook, candidate)
-        if candidate_distance < distance:
-            code, distance = candidate, candidate_distance
+        code, distance = closer(dim, x, row, codebook, code, distance, candidate)
     return code
+
+
+@inline
+def _reach(squared, score, margin):
+    """Distance of a row to codes with a score, less what rounding may have added."""
+    return np.sqrt(max(F(0.0), squared + F(2.0) * (score - margin)))
 
 
 @cache
@@ -204,11 +217,12 @@ def _search_kernel(dim: int) -> Any:
     def search(tile, _, x, codebook, centre, blocks, halves, longest, result, lists, distances):
         count = result.shape[0]
         with_lists = lists.shape[0] > 0
-        kept = _BEST if with_lists else _FEW
+        kept = _BEST if with_lists else _BEST_ALONE
         rounding = F(2.0 * (dim + 8) * 2.0**-24)
         rows, squared = np.empty(_TILE * dim, np.float32), np.zeros(_TILE, np.float32)
         scores, codes = np.empty(_TILE * _BEST, np.float32), np.empty(_TILE * _BEST, np.int32)
         limits, slack = np.empty(_TILE, np.float32), np.empty(_TILE, np.float32)
+        margins = np.empty(_TILE, np.float32)
         state = scores, codes, limits, slack, np.empty(32 * _GROUP, np.float32)
         start, valid = tile * _TILE, min(_TILE, count - tile * _TILE)
         for i in range(_TILE):
@@ -216,15 +230,14 @@ def _search_kernel(dim: int) -> Any:
                 value = x[(start + min(i, valid - 1)) * dim + j] - centre[j]
                 rows[i * dim + j] = value
                 squared[i] += value * value
-            reach = np.sqrt(squared[i]) + longest
+            norms = np.sqrt(squared[i]) + longest
+            margins[i] = rounding * norms * norms
             # Without a list, only codes that may be nearest after rounding are kept.
-            slack[i] = F(np.inf) if with_lists else F(2.0) * rounding * reach * reach
+            slack[i] = F(np.inf) if with_lists else F(2.0) * margins[i]
         _score_tile(dim, blocks, halves, rows, (valid + _GROUP - 1) // _GROUP * _GROUP, kept, state)
         for i in range(valid):
             at, row = i * _BEST, start + i
-            reach = np.sqrt(squared[i]) + longest
-            margin = rounding * reach * reach
-            limit, others = scores[at] + margin, scores[at + kept - 1]
+            limit, others = scores[at] + margins[i], scores[at + kept - 1]
             if others > limit:
                 result[row] = _settle(dim, x, row, codebook, scores, codes, at, kept, limit)
             else:
@@ -232,12 +245,9 @@ def _search_kernel(dim: int) -> Any:
             if with_lists:
                 for k in range(LIST):
                     lists[row * LIST + k] = codes[at + k] if scores[at + k] < F(np.inf) else codes[at]
-                distances[row] = np.sqrt(max(F(0.0), squared[i] + F(2.0) * (others - margin)))
+                distances[row] = _reach(squared[i], others, margins[i])
                 second = scores[at + 1]
-                clearance = F(0.0)
-                if second > limit:
-                    clearance = np.sqrt(max(F(0.0), squared[i] + F(2.0) * (second - margin)))
-                distances[count + row] = clearance
+                distances[count + row] = _reach(squared[i], second, margins[i]) if second > limit else F(0.0)
 
     return parallel(search)
 

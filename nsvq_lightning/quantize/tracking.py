@@ -22,28 +22,18 @@ from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import INT64, Array, check_array
 from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, Memory, box_search, sort_into_leaves
 from nsvq_lightning.quantize.nearest import check_rows, nearest
-from nsvq_lightning.quantize.scores import LIST, score_search, squares, true_distance
-
-
-@inline
-def _member(dim, x, at, codebook, lists, place, keep):
-    return squares(dim, x, at, codebook, np.int64(simd.get(lists, place)) * dim, keep)
+from nsvq_lightning.quantize.scores import LIST, closer, score_search, squares
 
 
 @inline
 def _list_squared(dim, x, at, codebook, lists, start, keep):
     """Squared distances to the codes of a list, one per lane; the other lanes hold 0."""
+
+    def member(k):
+        return squares(dim, x, at, codebook, np.int64(simd.get(lists, start + k)) * dim, keep)
+
     return simd.lane_sums(
-        (
-            _member(dim, x, at, codebook, lists, start, keep),
-            _member(dim, x, at, codebook, lists, start + 1, keep),
-            _member(dim, x, at, codebook, lists, start + 2, keep),
-            _member(dim, x, at, codebook, lists, start + 3, keep),
-            _member(dim, x, at, codebook, lists, start + 4, keep),
-            _member(dim, x, at, codebook, lists, start + 5, keep),
-            _member(dim, x, at, codebook, lists, start + 6, keep),
-            _member(dim, x, at, codebook, lists, start + 7, keep),
-        )
+        (member(0), member(1), member(2), member(3), member(4), member(5), member(6), member(7)),
     )
 
 
@@ -57,9 +47,7 @@ def _settle(dim, x, row, codebook, lists, start, near):
     while near != 0:
         candidate = np.int64(simd.get(lists, start + simd.lowest_bit(near)))
         near &= near - 1
-        candidate_distance = true_distance(dim, x, row, codebook, candidate)
-        if candidate_distance < distance or (candidate_distance == distance and candidate < code):
-            code, distance = candidate, candidate_distance
+        code, distance = closer(dim, x, row, codebook, code, distance, candidate)
     return code
 
 
