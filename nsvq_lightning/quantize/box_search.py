@@ -37,9 +37,17 @@ class Memory(NamedTuple):
     clearance: Array
 
     @classmethod
-    def empty(cls, count: int, dim: int) -> "Memory":
-        """Memory of ``count`` rows that have not been searched."""
-        return cls(np.full(count, -1, np.int32), np.zeros((count, dim), np.float32), np.full(count, -np.inf))
+    def empty(cls, dim: int) -> "Memory":
+        """Memory of no rows."""
+        return cls(np.empty(0, np.int32), np.empty((0, dim), np.float32), np.empty(0))
+
+    def grown(self, more: int) -> "Memory":
+        """With ``more`` rows that have not been searched."""
+        return Memory(
+            np.pad(self.last, (0, more), constant_values=-1),
+            np.pad(self.anchors, ((0, more), (0, 0))),
+            np.pad(self.clearance, (0, more), constant_values=-np.inf),
+        )
 
 
 # Beyond this dimension, boxes prune too little, and the scores of :mod:`scores` are faster.
@@ -152,7 +160,7 @@ def _pack(node, _, points, order, codes, labels, leaves, nodes):
         nodes[node // 16, j, 1, node % 16] = node_high
 
 
-def _boxes(codebook: Array, order: Array) -> tuple[Any, ...]:
+def _boxes(codebook: Array, order: Array) -> tuple[Array, ...]:
     """The codes in boxes, flat.
 
     Leaves ``[nodes · 16, D, 16]``, lanes without a code at infinity; the codes of their lanes ``[nodes · 16, 16]``;
@@ -160,10 +168,14 @@ def _boxes(codebook: Array, order: Array) -> tuple[Any, ...]:
     """
     count, dim = codebook.shape
     nodes = -(-count // 4096) * 16
-    codes, labels = aligned_empty((nodes * 16, dim, 16)), np.empty((nodes * 16, 16), np.int32)
-    corners = aligned_empty((nodes, dim, 2, 16)), aligned_empty((nodes // 16, dim, 2, 16))
-    _pack(nodes, _points(codebook), order, codes, labels, *corners)
-    return codes.ravel(), labels.ravel(), corners[0].ravel(), corners[1].ravel()
+    tree = (
+        aligned_empty((nodes * 16, dim, 16)),
+        np.empty((nodes * 16, 16), np.int32),
+        aligned_empty((nodes, dim, 2, 16)),
+        aligned_empty((nodes // 16, dim, 2, 16)),
+    )
+    _pack(nodes, _points(codebook), order, *tree)
+    return tuple(array.ravel() for array in tree)
 
 
 @inline
@@ -270,22 +282,29 @@ def _guess(dim, tree, x, count, state):
 
 
 @inline
+def _limit(i, state):
+    """Distance beyond which no code matters: the best so far, or the second-best if that is needed."""
+    best, _, second, _, _, _, bounded = state
+    return simd.get(second, i) if bounded else simd.get(best, i)
+
+
+@inline
 def _visit_leaves(dim, tree, x, state, pending):
     """Visit the pending (query, leaf) pairs."""
-    best, _, second, _, tasks, _, bounded = state
+    tasks = state[4]
     for t in range(pending):
         i, leaf = simd.get(tasks, 2 * t), simd.get(tasks, 2 * t + 1)
-        _visit_leaf(dim, tree, leaf, x, i, simd.get(second, i) if bounded else simd.get(best, i), state)
+        _visit_leaf(dim, tree, leaf, x, i, _limit(i, state), state)
 
 
 @inline
 def _visit_near(dim, tree, x, count, state):
-    """Visit every other leaf that is not farther than the best code so far, or the second-best if that is needed."""
+    """Visit every other leaf that may hold a code that matters."""
     _, _, leaves, nodes = tree
-    best, _, second, guess, tasks, _, bounded = state
+    _, _, _, guess, tasks, _, _ = state
     pending = 0
     for i in range(count):
-        row, limit = i * dim, simd.get(second, i) if bounded else simd.get(best, i)
+        row, limit = i * dim, _limit(i, state)
         for group in range(nodes.size // (32 * dim)):
             near_nodes = simd.mask_bits(_box_distances(dim, nodes, group * 32 * dim, x, row) <= limit)
             while near_nodes != 0:
@@ -309,40 +328,46 @@ def _search_kernel(dim: int) -> Any:
     """The search for one dimension, a compile-time constant, so that short loops over it are unrolled."""
     largest = np.finfo(np.float32).max
 
-    def search(block, _, x, rows, codebook, codes, labels, leaves, nodes, memory, travelled, result):
+    def search(block, _, x, rows, codebook, tree, memory, travelled, result):
         last_codes, anchors, clearance = memory
-        total, bounded = result.shape[0], last_codes.shape[0] > 0
-        best, label, second = np.empty(_ROWS, np.float32), np.empty(_ROWS, np.int32), np.empty(_ROWS, np.float32)
-        guess, tasks = np.empty(_ROWS, np.int64), np.empty(2 * _TASKS, np.int64)
-        state = best, label, second, guess, tasks, np.empty(16, np.float32), bounded
-        tree, queries = (codes, labels, leaves, nodes), np.empty(_ROWS * dim, np.float32)
-        places = np.empty(_ROWS, np.int64)
-        count, first, stop = 0, block * _ROWS, min(total, (block + 1) * _ROWS)
+        bounded = last_codes.shape[0] > 0
+        best, second = np.empty(_ROWS, np.float32), np.empty(_ROWS, np.float32)
+        label, guess = np.empty(_ROWS, np.int32), np.empty(_ROWS, np.int64)
+        state = best, label, second, guess, np.empty(2 * _TASKS, np.int64), np.empty(16, np.float32), bounded
+        queries, places = np.empty(_ROWS * dim, np.float32), np.empty(_ROWS, np.int64)
+        first, stop = block * _ROWS, min(result.shape[0], (block + 1) * _ROWS)
         found_outside = count_outside(rows, first, stop, x.shape[0] // dim)
-        for i in range(first, stop if found_outside == 0 else first):
-            row = simd.get(rows, i)
-            last = np.int64(simd.get(last_codes, row)) if bounded else np.int64(-1)
-            simd.put(result, i, last)
-            simd.put(places, count, i)
-            known = last >= 0 and last < codebook.shape[0] // dim
-            count += not (known and _prove(dim, codebook, x, row, last, memory, travelled))
-        for i in range(count):
-            row = simd.get(rows, simd.get(places, i))
-            for j in range(dim):
-                simd.put(queries, i * dim + j, simd.get(x, row * dim + j))
+        if found_outside > 0:
+            return found_outside
+        count = 0
+        for i in range(first, stop):
+            row, proven = simd.get(rows, i), False
+            if bounded:
+                code = np.int64(simd.get(last_codes, row))
+                simd.put(result, i, code)
+                known = code >= 0 and code < codebook.shape[0] // dim
+                proven = known and _prove(dim, codebook, x, row, code, memory, travelled)
+            if not proven:
+                simd.put(places, count, i)
+                for j in range(dim):
+                    simd.put(queries, count * dim + j, simd.get(x, row * dim + j))
+                count += 1
         _guess(dim, tree, queries, count, state)
         _visit_near(dim, tree, queries, count, state)
         for i in range(count):
-            nearest = simd.get(label, i) if simd.get(label, i) != _NO_CODE else np.int32(0)
-            simd.put(result, simd.get(places, i), np.int64(nearest))
+            place, nearest = simd.get(places, i), simd.get(label, i)
+            if nearest == _NO_CODE:
+                nearest = np.int32(0)
+            simd.put(result, place, nearest)
             if bounded:
-                # Keep where the row was searched; there may still be codes beyond the largest float32 number.
-                row, away = simd.get(rows, simd.get(places, i)), min(simd.get(second, i), largest)
+                row = simd.get(rows, place)
                 simd.put(last_codes, row, nearest)
                 for j in range(dim):
                     simd.put(anchors, row * dim + j, simd.get(queries, i * dim + j))
-                simd.put(clearance, row, np.sqrt(np.float64(away)) / ROUNDING + travelled)
-        return found_outside
+                # There may still be codes beyond the largest float32 number.
+                away = np.float64(min(simd.get(second, i), largest))
+                simd.put(clearance, row, np.sqrt(away) / ROUNDING + travelled)
+        return 0
 
     return parallel(search)
 
@@ -372,23 +397,24 @@ def box_search(
         TypeError: A dtype is wrong.
     """
     check_table("x", x)
-    (count, dim), num_codes = x.shape, len(codebook)
+    count, dim = x.shape
+    num_codes = len(codebook)
     check_array("codebook", codebook, (num_codes, dim), x.dtype)
     order = sort_into_leaves(codebook) if order is None else order
     rows = np.arange(count) if rows is None else rows
-    known = Memory.empty(0, dim) if memory is None else memory
-    remembered = max(count, len(known.last)) if memory is not None else 0
+    remembered = 0 if memory is None else max(count, len(memory.last))
+    last, anchors, clearance = memory or Memory.empty(dim)
     check_array("order", order, (num_codes,), INT32)
     check_array("rows", rows, (rows.size,), INT64)
-    check_array("memory.last", known.last, (remembered,), INT32)
-    check_array("memory.anchors", known.anchors, (remembered, dim), FLOAT32)
-    check_array("memory.clearance", known.clearance, (remembered,), np.dtype(np.float64))
+    check_array("memory.last", last, (remembered,), INT32)
+    check_array("memory.anchors", anchors, (remembered, dim), FLOAT32)
+    check_array("memory.clearance", clearance, (remembered,), np.dtype(np.float64))
     if order.min() < 0 or order.max() >= num_codes:
         raise outside("order", order, num_codes)
     result = np.empty(len(rows), np.int64)
     thread_count()
-    flat = known.last, known.anchors.ravel(), known.clearance
-    blocks, boxes = -(-len(rows) // _ROWS), _boxes(codebook, order)
-    if _search_kernel(dim)(blocks, x.ravel(), rows, codebook.ravel(), *boxes, flat, float(travelled), result):
+    blocks, tree = -(-len(rows) // _ROWS), _boxes(codebook, order)
+    known = last, anchors.ravel(), clearance
+    if _search_kernel(dim)(blocks, x.ravel(), rows, codebook.ravel(), tree, known, float(travelled), result):
         raise outside("rows", rows, count)
     return result

@@ -113,8 +113,8 @@ class NearestTracker:
         self._order: Array | None = None
         self._snapshot = np.zeros((0, 0), np.float32)
         self._travelled = 0.0
-        self._memory = Memory.empty(0, 0)
-        self._lists, self._limits = np.zeros((0, LIST), np.int32), np.zeros(0)
+        self._memory = Memory.empty(0)
+        self._lists, self._limits = np.empty((0, LIST), np.int32), np.empty(0)
 
     def search(self, x: Tensor, codebook: Tensor, rows: Tensor | None = None) -> Tensor:
         """Nearest codes, the result of :func:`nearest` for the chosen rows.
@@ -160,14 +160,13 @@ class NearestTracker:
         dim = codebook.shape[1]
         if self._snapshot.shape != codebook.shape:
             self.forget()
-            self._snapshot, self._memory = codebook.copy(), Memory.empty(0, dim)
-        new = count - len(self._memory.last)
-        if new > 0:
-            tables: Any = zip(self._memory, Memory.empty(new, dim), strict=True)
-            self._memory = Memory(*map(np.concatenate, tables))
+            self._snapshot, self._memory = codebook.copy(), Memory.empty(dim)
+        more = count - len(self._memory.last)
+        if more > 0:
+            self._memory = self._memory.grown(more)
             if dim > MAX_DIM:
-                self._lists = np.append(self._lists, np.zeros((new, LIST), np.int32), 0)
-                self._limits = np.append(self._limits, np.full(new, -np.inf))
+                self._lists = np.pad(self._lists, ((0, more), (0, 0)))
+                self._limits = np.pad(self._limits, (0, more), constant_values=-np.inf)
 
     def _search_boxes(self, x: Array, codebook: Array, rows: Array) -> Array:
         if self._steps % 32 == 0 or self._order is None:  # boxes in an old order are larger
