@@ -77,14 +77,13 @@ def walk(dim: int, steps: int, size: float) -> Iterator[tuple[torch.Tensor, ...]
 def searched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Length of the queue of each search."""
     lengths: list[int] = []
-    take_snapshot = DeviceTracker._take_snapshot
+    follow_jump = DeviceTracker._follow_jump
 
-    def counting(self: DeviceTracker, codebook: torch.Tensor, ends: torch.Tensor, count: int, *, always: bool) -> None:
-        if not always:
-            lengths.append(int(ends[-1]))
-        take_snapshot(self, codebook, ends, count, always=always)
+    def counting(self: DeviceTracker, codebook: torch.Tensor, ends: torch.Tensor, count: int) -> None:
+        lengths.append(int(ends[-1]))
+        follow_jump(self, codebook, ends, count)
 
-    monkeypatch.setattr(DeviceTracker, "_take_snapshot", counting)
+    monkeypatch.setattr(DeviceTracker, "_follow_jump", counting)
     return lengths
 
 

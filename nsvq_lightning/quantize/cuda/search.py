@@ -138,6 +138,12 @@ def bound(squared):
 
 
 @triton.jit
+def bound_below(squared):
+    """A distance in float64, rounded down, and finite."""
+    return tl.sqrt(tl.minimum(squared, LARGEST).to(tl.float64)) / SLACK
+
+
+@triton.jit
 def drift_kernel(codebook, snapshot, squared_drift, num_codes, DIM: tl.constexpr, BLOCK: tl.constexpr):
     """Raise ``squared_drift[0]``, the bits of a float32, to how far any of the codes has moved since the snapshot."""
     code = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -165,14 +171,9 @@ def have_jumped(ends, count):
 
 
 @triton.jit(do_not_specialize=["count"])
-def snapshot_kernel(
-    codebook, snapshot, travelled, squared_drift, ends, count, size, ALWAYS: tl.constexpr, BLOCK: tl.constexpr
-):  # fmt: skip
-    """Take a snapshot of the codes, if they have jumped or ``ALWAYS``."""
-    wanted = True
-    if not ALWAYS:
-        wanted = have_jumped(ends, count)
-    if wanted:
+def snapshot_kernel(codebook, snapshot, travelled, squared_drift, ends, count, size, BLOCK: tl.constexpr):
+    """Take a snapshot of the codes, if they have jumped."""
+    if have_jumped(ends, count):
         place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
         tl.store(snapshot + place, tl.load(codebook + place, mask=place < size, other=0.0), mask=place < size)
         if tl.program_id(0) == 0:
@@ -204,12 +205,14 @@ def check_kernel(
     known = code >= 0
     drift = drift_of(squared_drift)
     way = tl.load(travelled) + drift
-    squared_move, squared = tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.float32)
+    squared_move = tl.zeros([BLOCK], tl.float32)
+    squared = squared_move
     for j in range(DIM):
         value = tl.load(x + row * DIM + j, mask=known, other=0.0)
         step = value - tl.load(anchors + row * DIM + j, mask=known, other=0.0)
         away = value - tl.load(codebook + code.to(tl.int64) * DIM + j, mask=known, other=0.0)
-        squared_move, squared = tl.fma(step, step, squared_move), tl.fma(away, away, squared)
+        squared_move = tl.fma(step, step, squared_move)
+        squared = tl.fma(away, away, squared)
     moved = bound(squared_move)
     proven = known & (bound(squared) + moved < tl.load(clearance + row, mask=known, other=0.0) - way)
     open_ = known & ~proven
@@ -221,8 +224,7 @@ def check_kernel(
             value = tl.load(x + row * DIM + j, mask=open_, other=0.0)
             away = tl.load(codebook + listed.to(tl.int64) * DIM + j, mask=open_[:, None], other=0.0) - value[:, None]
             distances = tl.fma(away, away, distances)
-        least = tl.min(distances, 1)
-        nearest = tl.min(tl.where(distances == least[:, None], listed, 0x7FFFFFFF), 1)
+        least, nearest = least_of(distances, listed, 0x7FFFFFFF)
         limit = tl.load(limits + row, mask=open_, other=0.0)
         listed_is_nearest = open_ & (bound(least) + moved < limit - way)
         code = tl.where(listed_is_nearest, nearest, code)
@@ -230,7 +232,7 @@ def check_kernel(
         tl.store(last + row, code, mask=listed_is_nearest)
         # Where the gap to the second code exceeds how far the row has moved, a new anchor pays.
         others = tl.min(tl.where(listed == nearest[:, None], float("inf"), distances), 1)
-        second = tl.sqrt(tl.minimum(others, LARGEST).to(tl.float64)) / SLACK
+        second = bound_below(others)
         anew = listed_is_nearest & (second - bound(least) > moved)
         for j in range(DIM):
             tl.store(anchors + row * DIM + j, tl.load(x + row * DIM + j, mask=anew, other=0.0), mask=anew)
@@ -265,12 +267,11 @@ def search_kernel(
         for member in tl.static_range(LIST):
             least, code = least_of(smallest, chosen, num_codes)
             if member == 1:
-                near = tl.minimum(tl.minimum(least, outside), LARGEST)
-                tl.store(clearance + row, tl.sqrt(near.to(tl.float64)) / SLACK + before, mask=inside)
+                tl.store(clearance + row, bound_below(tl.minimum(least, outside)) + before, mask=inside)
             tl.store(lists + row * LIST + member, code, mask=inside)
             smallest = tl.where(chosen == code[:, None], float("inf"), smallest)
-        far = tl.minimum(tl.minimum(tl.min(smallest, 1), outside), LARGEST)
-        tl.store(limits + row, tl.sqrt(far.to(tl.float64)) / SLACK + before, mask=inside)
+        far = tl.minimum(tl.min(smallest, 1), outside)
+        tl.store(limits + row, bound_below(far) + before, mask=inside)
         for j in range(DIM):
             tl.store(anchors + row * DIM + j, tl.load(x + row * DIM + j), mask=inside)
 
@@ -329,7 +330,7 @@ class DeviceTracker:
                 x, rows, queue, ends, codes, *self._memory, *travel, result, count, self.num_codes, codes.shape[1],
                 DIM=self.dim, ROWS=ROWS, CODES=CODES, LIST=LIST, num_warps=1, **COMPILE,
             )  # fmt: skip
-            self._take_snapshot(codebook, ends, count, always=False)
+            self._follow_jump(codebook, ends, count)
         return result
 
     def _follow(self, codebook: Tensor) -> None:
@@ -340,14 +341,16 @@ class DeviceTracker:
             codebook, self._snapshot, self._squared_drift, self.num_codes, DIM=self.dim, BLOCK=BLOCK, **COMPILE
         )
         if self._steps % SNAPSHOT_STEPS == 0:
-            self._take_snapshot(codebook, self._squared_drift, 1, always=True)
+            self._travelled += self._squared_drift.view(torch.float32).double().sqrt() * ROUNDING
+            self._snapshot.copy_(codebook)
             self._squared_drift.zero_()
 
-    def _take_snapshot(self, codebook: Tensor, ends: Tensor, count: int, *, always: bool) -> None:
-        snapshot_kernel[(triton.cdiv(codebook.numel(), COPIED),)](
-            codebook, self._snapshot, self._travelled, self._squared_drift, ends, count, codebook.numel(),
-            ALWAYS=always, BLOCK=COPIED, **COMPILE,
-        )  # fmt: skip
+    def _follow_jump(self, codebook: Tensor, ends: Tensor, count: int) -> None:
+        """Take a snapshot if codes have jumped."""
+        size = codebook.numel()
+        snapshot_kernel[(triton.cdiv(size, COPIED),)](
+            codebook, self._snapshot, self._travelled, self._squared_drift, ends, count, size, BLOCK=COPIED, **COMPILE
+        )
 
     def _grow(self, count: int) -> None:
         """Make room for ``count`` rows."""

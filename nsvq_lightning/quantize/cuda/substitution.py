@@ -19,7 +19,7 @@ from nsvq_lightning.quantize import substitution
 
 SPLIT = tl.constexpr(0x3F3504F3)  # bits of 1/√2: a mantissa lies in [1/√2, √2)
 TWO_LOG2_E = tl.constexpr(2 / math.log(2))
-L0, L1, L2, L3, L4 = (tl.constexpr(1 / odd) for odd in (11, 9, 7, 5, 3))
+ARTANH = tl.constexpr((1 / 11, 1 / 9, 1 / 7, 1 / 5, 1 / 3, 1.0))
 TINY = tl.constexpr(torch.finfo(torch.float32).tiny)
 
 
@@ -31,15 +31,14 @@ def log2(x):
     mantissa = (bits - (exponent << 23)).to(tl.float32, bitcast=True)
     s = tl.div_rn(mantissa - 1, mantissa + 1)
     squared = s * s
-    series = tl.fma(tl.zeros_like(s) + L0, squared, L1)
-    series = tl.fma(tl.fma(series, squared, L2), squared, L3)
-    series = tl.fma(tl.fma(series, squared, L4), squared, 1.0)
+    series = tl.zeros_like(s) + ARTANH[0]
+    for power in tl.static_range(1, 6):
+        series = tl.fma(series, squared, ARTANH[power])
     return tl.fma(s * TWO_LOG2_E, series, exponent.to(tl.float32))
 
 
 GOLDEN, FIRST, SECOND = (tl.constexpr(value) for value in substitution.MULTIPLIERS)
-C0, C1, C2, C3, C4, C5 = (tl.constexpr(value) for value in substitution.COS)
-S0, S1, S2, S3, S4, S5 = (tl.constexpr(value) for value in substitution.SIN)
+COS, SIN = tl.constexpr(substitution.COS), tl.constexpr(substitution.SIN)
 UNIT = tl.constexpr(2.0**-24)
 MINUS_TWO_LN2 = tl.constexpr(-2 * math.log(2))
 
@@ -64,9 +63,9 @@ def normal(seed, vector, lane):
     length = tl.sqrt_rn(log2(radius) * MINUS_TWO_LN2)
     t = turn * turn
     even = vector % 2 == 0
-    value = tl.fma(tl.where(even, C0, S0), t, tl.where(even, C1, S1))
-    value = tl.fma(tl.fma(value, t, tl.where(even, C2, S2)), t, tl.where(even, C3, S3))
-    value = tl.fma(tl.fma(value, t, tl.where(even, C4, S4)), t, tl.where(even, C5, S5))
+    value = tl.where(even, COS[0], SIN[0])
+    for power in tl.static_range(1, 6):
+        value = tl.fma(value, t, tl.where(even, COS[power], SIN[power]))
     return length * tl.where(even, value, turn * value)
 
 
@@ -257,17 +256,18 @@ def sorted_by_code(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
     return order, starts
 
 
-# Rows by code of codes that still exist, after the version of these codes and how many there may be.
+# Rows by code of codes that still exist, with the version of these codes and how many there may be.
 _sorted = WeakTensorKeyDictionary()
 
 
 def _remembered(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
     """:func:`sorted_by_code`, once for codes that stay the same, as frozen ones do."""
-    version, count, *found = _sorted.get(codes, (-1, -1))
-    if (version, count) != (codes._version, num_codes):
-        found = list(sorted_by_code(codes, num_codes))
-        _sorted[codes] = codes._version, num_codes, found[0], found[1]
-    return found[0], found[1]
+    state = codes._version, num_codes
+    known, found = _sorted.get(codes, (None, None))
+    if known != state:
+        found = sorted_by_code(codes, num_codes)
+        _sorted[codes] = state, found
+    return found
 
 
 def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) -> Tensor:
