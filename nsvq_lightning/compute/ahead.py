@@ -36,10 +36,15 @@ def start() -> None:
         return
     # They find the package where this process has found it.
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    silent: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
     for _ in range(min(4, usable_cores() - 1)):  # more would wait for one another
         with suppress(OSError):
-            process = subprocess.Popen([sys.executable, "-m", __name__], env=environment, **silent)
+            process = subprocess.Popen(
+                [sys.executable, "-m", __name__],
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
             atexit.register(process.terminate)
 
 

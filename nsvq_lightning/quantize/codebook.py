@@ -85,9 +85,9 @@ class CodebookQuantizer(nn.Module, ABC):
         self, num_codes: int, dim: int, *, kmeans_steps: int = 10, start: Literal["sample", "spread"] = "sample"
     ) -> None:
         super().__init__()
-        for name, value, least in (("num_codes", num_codes, 1), ("dim", dim, 1), ("kmeans_steps", kmeans_steps, 0)):
-            if value < least:
-                raise ValueError(f"{name} must be at least {least}, got {value}")
+        for name, value, bound in (("num_codes", num_codes, 1), ("dim", dim, 1), ("kmeans_steps", kmeans_steps, 0)):
+            if value < bound:
+                raise ValueError(f"{name} must be at least {bound}, got {value}")
         if start not in ("sample", "spread"):
             raise ValueError(f"start must be 'sample' or 'spread', got {start!r}")
         self.kmeans_steps = kmeans_steps
@@ -137,8 +137,8 @@ class CodebookQuantizer(nn.Module, ABC):
         """
         if x.dim() != 2 or x.shape[1] != self.dim:
             raise ValueError(f"rows must have shape [N, {self.dim}], got {list(x.shape)}")
-        draws, spread = generator or seeded(0), self.start == "spread"
-        centroids = kmeans(x, self.num_codes, draws, weight, self.kmeans_steps, spread=spread)
+        spread = self.start == "spread"
+        centroids = kmeans(x, self.num_codes, generator or seeded(0), weight, self.kmeans_steps, spread=spread)
         self._resize(centroids.shape[0])
         with torch.no_grad():
             self.codebook.copy_(centroids)
@@ -226,10 +226,10 @@ class CodebookQuantizer(nn.Module, ABC):
         inactive = self.usage < 0.01 * self.window
         replaced = (inactive & finite).nonzero()[:, 0]
         active = self.codebook[~inactive & finite]
-        if len(replaced) and not len(active):
+        if len(active) == 0 < len(replaced):
             _log.warning("no code was active in %d iterations; the codebook is left as it is", int(self.window))
             replaced = replaced[:0]
-        if len(replaced):
+        if len(replaced) > 0:
             if rows is None:
                 new = copy_codes(active, len(replaced), generator)
             else:

@@ -72,17 +72,20 @@ class _Lookup(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, codebook: Tensor, codes: Tensor, x: Tensor | None, rows: Tensor | None) -> Tensor:
         ctx.save_for_backward(codes, rows)
-        ctx.num_codes, ctx.count = len(codebook), 0 if x is None else len(x)
+        ctx.num_codes = len(codebook)
+        ctx.count = 0 if x is None else len(x)
         return codebook.index_select(0, codes)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, None, Tensor | None, None]:
         codes, rows = ctx.saved_tensors
-        by_code = sum_by_code(grad, codes, ctx.num_codes) if ctx.needs_input_grad[0] else None
-        if not ctx.needs_input_grad[2]:
-            return by_code, None, None, None
-        return by_code, None, grad if rows is None else put_rows(grad, rows, ctx.count), None
+        by_code = by_row = None
+        if ctx.needs_input_grad[0]:
+            by_code = sum_by_code(grad, codes, ctx.num_codes)
+        if ctx.needs_input_grad[2]:
+            by_row = grad if rows is None else put_rows(grad, rows, ctx.count)
+        return by_code, None, by_row, None
 
 
 @torch.no_grad()
@@ -147,9 +150,11 @@ def _lloyd_step(x: Tensor, centroids: Tensor, weight: Tensor | None) -> Tensor:
     codes = nearest(x, centroids)
     k = len(centroids)
     if weight is None:
-        sums, mass = sum_by_code(x, codes, k, torch.float64), torch.bincount(codes, minlength=k).double()
+        sums = sum_by_code(x, codes, k, torch.float64)
+        mass = torch.bincount(codes, minlength=k).double()
     else:
-        sums, mass = sum_by_code(x * weight[:, None], codes, k), sum_by_code(weight[:, None], codes, k)[:, 0]
+        sums = sum_by_code(x * weight[:, None], codes, k)
+        mass = sum_by_code(weight[:, None], codes, k)[:, 0]
     means = sums / mass.clamp_min(torch.finfo(torch.float64).tiny)[:, None]
     return torch.where(mass[:, None] > 0, means.to(centroids.dtype), centroids)
 

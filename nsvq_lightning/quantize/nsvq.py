@@ -71,7 +71,7 @@ class _Substitution(torch.autograd.Function):
             out: Tensor = chosen + residual.norm(dim=1, keepdim=True) * _directions(residual, *mix)
         else:
             seed, aim, spread = mix
-            inputs = (tensor.detach().contiguous() for tensor in (x, rows, codebook, codes))
+            inputs = (tensor.contiguous() for tensor in (x, rows, codebook, codes))
             out = ctx.kernels.substitute(seed, *inputs, aim=aim, spread=spread)
         ctx.save_for_backward(x, rows, codebook, codes, out)
         return out
@@ -83,11 +83,12 @@ class _Substitution(torch.autograd.Function):
         if ctx.kernels is None:
             residual = x.index_select(0, rows) - codebook[codes]
             radial = (grad * _directions(residual, *ctx.mix)).sum(1, keepdim=True) * _unit(residual)
-            grads = put_rows(grad + radial, rows, len(x)), -sum_by_code(radial, codes, len(codebook))
+            grad_x = put_rows(grad + radial, rows, len(x))
+            grad_codebook = -sum_by_code(radial, codes, len(codebook))
         else:
-            inputs = (tensor.detach().contiguous() for tensor in (grad, x, rows, codebook, codes, out))
-            grads = ctx.kernels.substitute_backward(*inputs)
-        return *grads, None, None, None
+            inputs = (tensor.contiguous() for tensor in (grad, x, rows, codebook, codes, out))
+            grad_x, grad_codebook = ctx.kernels.substitute_backward(*inputs)
+        return grad_x, grad_codebook, None, None, None
 
 
 def _kernels(like: Tensor) -> Any:

@@ -73,8 +73,18 @@ def closer(dim, x, row, codebook, code, distance, candidate):
 
 
 @inline
+def new_lanes(dim):
+    """1 in the lanes of a row's last vector that the one before does not cover; a single 1 for short rows."""
+    keep = np.empty(16, np.float32)
+    covered = -dim % 16 if dim >= 16 else 15
+    for lane in range(16):
+        keep[lane] = lane >= covered
+    return keep
+
+
+@inline
 def squares(dim, a, at_a, b, at_b, keep):
-    """Squared differences of two rows, to be summed. ``keep`` masks the overlap of the last two vectors."""
+    """Squared differences of two rows, to be summed. ``keep`` are the :func:`new_lanes` of such rows."""
     total = simd.broadcast(0)
     if dim < 16:
         for j in range(dim):
@@ -113,8 +123,9 @@ def _insert(scores, codes, at, kept, score, code):
 
 
 @inline
-def _keep(scores, codes, limits, slack, kept, first, block, found):
+def _keep(kept, first, block, state):
     """Of the scores ``found`` of a block, insert those below the limits of 6 rows."""
+    scores, codes, limits, slack, found = state
     for i in range(_GROUP):
         limit = simd.get(limits, first + i)
         low, high = simd.load(found, 32 * i), simd.load(found, 32 * i + 16)
@@ -142,7 +153,7 @@ def _below(sums, limits, row):
 @inline
 def _score_block(dim, blocks, halves, block, rows, first, kept, state):
     """Scores of 6 rows against 32 codes: 12 sums that hide each other's latency."""
-    scores, codes, limits, slack, found = state
+    _, _, limits, _, found = state
     s0 = s1 = s2 = s3 = s4 = s5 = simd.load(halves, block * 32), simd.load(halves, block * 32 + 16)
     for j in range(dim):
         at, row = (block * dim + j) * 32, first * dim + j
@@ -165,15 +176,14 @@ def _score_block(dim, blocks, halves, block, rows, first, kept, state):
         sums = s0 + s1 + s2 + s3 + s4 + s5
         for k in range(12):
             simd.store(found, 16 * k, sums[k])
-        _keep(scores, codes, limits, slack, kept, first, block, found)
+        _keep(kept, first, block, state)
 
 
 @inline
 def _score_tile(dim, blocks, halves, rows, count, kept, state):
-    scores, codes, limits, _, _ = state
+    scores, _, limits, _, _ = state
     for i in range(count * _BEST):
         simd.put(scores, i, F(np.inf))
-        simd.put(codes, i, np.int32(0))
     for i in range(count):
         simd.put(limits, i, F(np.inf))
     total = halves.shape[0] // 32
@@ -220,9 +230,8 @@ def _search_kernel(dim: int) -> Any:
         kept = _BEST if with_lists else _BEST_ALONE
         rounding = F(2.0 * (dim + 8) * 2.0**-24)
         rows, squared = np.empty(_TILE * dim, np.float32), np.zeros(_TILE, np.float32)
-        scores, codes = np.empty(_TILE * _BEST, np.float32), np.empty(_TILE * _BEST, np.int32)
-        limits, slack = np.empty(_TILE, np.float32), np.empty(_TILE, np.float32)
-        margins = np.empty(_TILE, np.float32)
+        scores, codes = np.empty(_TILE * _BEST, np.float32), np.zeros(_TILE * _BEST, np.int32)
+        limits, slack, margins = np.empty(_TILE, np.float32), np.empty(_TILE, np.float32), np.empty(_TILE, np.float32)
         state = scores, codes, limits, slack, np.empty(32 * _GROUP, np.float32)
         start, valid = tile * _TILE, min(_TILE, count - tile * _TILE)
         for i in range(_TILE):

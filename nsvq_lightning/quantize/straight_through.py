@@ -70,7 +70,7 @@ class PostHoc(CodebookQuantizer):
 
     def __init__(self, num_codes: int, dim: int, **settings: Any) -> None:
         super().__init__(num_codes, dim, **settings)
-        self.most_codes = num_codes
+        self.max_codes = num_codes
 
     def limit(self, codes: int) -> None:
         """Have at most ``codes`` codes from the next :meth:`fit` on.
@@ -79,11 +79,11 @@ class PostHoc(CodebookQuantizer):
             ValueError: ``codes`` is below 1.
         """
         super().limit(codes)
-        self.most_codes = self.num_codes
+        self.max_codes = self.num_codes
 
     def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
         """Fit the codebook as :meth:`CodebookQuantizer.fit` does; K may grow again if earlier rows made it smaller."""
-        self._resize(self.most_codes)
+        self._resize(self.max_codes)
         super().fit(x, weight, generator)
 
     def forward(

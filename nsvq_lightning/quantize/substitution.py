@@ -23,6 +23,7 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import INT64, Array, flat_checked, outside, recycled
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside
+from nsvq_lightning.quantize.scores import new_lanes
 
 
 @inline
@@ -38,7 +39,6 @@ COS = (-21.071106, 58.790493, -85.271622, 64.928658, -19.738981, 0.99999923)
 SIN = (-12.471244, 41.342884, -76.614471, 81.599945, -41.341591, 6.283185)
 
 _GOLDEN, _FIRST, _SECOND = (np.uint64(value) for value in MULTIPLIERS)
-_S27, _S30, _S31, _S40, _LOW24 = np.uint64(27), np.uint64(30), np.uint64(31), np.uint64(40), np.uint64(0xFFFFFF)
 _COS, _SIN = (tuple(F(value) for value in each) for each in (COS, SIN))
 _UNIT, _TINY, _MINUS_TWO_LN2 = F(2.0**-24), np.finfo(np.float32).tiny, F(-2 * np.log(2))
 _ROWS = 256  # rows per unit of parallel work; the noise of a row depends only on its position
@@ -48,14 +48,14 @@ _ROWS = 256  # rows per unit of parallel work; the noise of a row depends only o
 def _uniforms(seed, pair, radius, angle):
     """Sixteen pairs starting at ``pair``: radius in (0, 1], angle in [-1/2, 1/2) turns, 24 random bits each."""
     key = np.uint64(seed)
-    second_key = (key ^ (key >> _S31)) * _SECOND
+    second_key = (key ^ (key >> np.uint64(31))) * _SECOND
     for lane in range(16):
         bits = (np.uint64(pair + lane) + key) * _GOLDEN
-        bits = (bits ^ (bits >> _S30)) * _FIRST
-        bits = (bits ^ (bits >> _S27) ^ second_key) * _SECOND
-        bits = bits ^ (bits >> _S31)
-        radius[lane] = F(np.int32(bits >> _S40) + np.int32(1)) * _UNIT
-        angle[lane] = F(np.int32(bits & _LOW24)) * _UNIT - F(0.5)
+        bits = (bits ^ (bits >> np.uint64(30))) * _FIRST
+        bits = (bits ^ (bits >> np.uint64(27)) ^ second_key) * _SECOND
+        bits = bits ^ (bits >> np.uint64(31))
+        radius[lane] = F(np.int32(bits >> np.uint64(40)) + np.int32(1)) * _UNIT
+        angle[lane] = F(np.int32(bits & np.uint64(0xFFFFFF))) * _UNIT - F(0.5)
 
 
 @inline
@@ -98,14 +98,6 @@ def _inverse(squared):
 
 
 @inline
-def _new_lanes(dim):
-    """1 in the lanes of a row's last vector that the one before does not cover."""
-    keep = np.ones(16, np.float32)
-    keep[: -dim % 16] = 0
-    return keep
-
-
-@inline
 def _short_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, stop):
     noise = np.empty(_ROWS * dim, np.float32)
     radius, angle = np.empty(16, np.float32), np.empty(16, np.float32)
@@ -135,7 +127,7 @@ def _short_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin,
 @inline
 def _long_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, stop):
     vectors = (dim + 15) // 16
-    keep = _new_lanes(dim)
+    keep = new_lanes(dim)
     radius, angle = np.empty(16, np.float32), np.empty(16, np.float32)
     noise, direction = np.empty(2 * vectors * 16, np.float32), np.empty(vectors * 16, np.float32)
     for i in range(begin, stop):
@@ -210,7 +202,7 @@ def _short_backward(dim, grad, x, rows, codebook, codes, out, grad_x, sums, begi
 @inline
 def _long_backward(dim, grad, x, rows, codebook, codes, out, grad_x, sums, begin, stop):
     vectors = (dim + 15) // 16
-    keep = _new_lanes(dim)
+    keep = new_lanes(dim)
     for i in range(begin, stop):
         at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
         dots, squared = simd.broadcast(0), simd.broadcast(0)
@@ -254,7 +246,7 @@ def _backward(dim: int) -> Any:
 
 
 def substitute(
-    seed: int, x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, *, aim: float = 0.0, spread: float = 1.0
+    seed: int, x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, *, aim: float, spread: float
 ) -> Tensor:
     """``x + ‖x − c‖·d/‖d‖`` with ``d = aim·(c − x) + spread·v``, v ~ N(0, I), for some rows of a table, ``[V, D]``.
 

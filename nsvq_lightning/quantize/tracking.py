@@ -22,7 +22,7 @@ from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import INT64, Array, check_array
 from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, Memory, box_search, sort_into_leaves
 from nsvq_lightning.quantize.nearest import check_rows, nearest
-from nsvq_lightning.quantize.scores import LIST, closer, score_search, squares
+from nsvq_lightning.quantize.scores import LIST, closer, new_lanes, score_search, squares
 
 
 @inline
@@ -58,9 +58,9 @@ _BLOCK = 256  # rows per unit of parallel work
 def _check_kernel(dim: int) -> Any:
     """The check for one dimension, a compile-time constant."""
 
-    def check(block, _, x, rows, codebook, memory, keep, travelled, drift, result):
+    def check(block, _, x, rows, codebook, memory, travelled, drift, result):
         last, lists, anchors, clearance, limits = memory
-        way = travelled + drift
+        way, keep = travelled + drift, new_lanes(dim)
         unused, scratch = np.zeros(16, np.float32), np.empty(16, np.float32)
         unused[LIST:] = np.inf
         for i in range(block * _BLOCK, min(rows.shape[0], (block + 1) * _BLOCK)):
@@ -181,13 +181,10 @@ class NearestTracker:
         result = np.empty(len(rows), np.int64)
         last, anchors, clearance = self._memory
         memory = last, self._lists.ravel(), anchors.ravel(), clearance, self._limits
-        dim = x.shape[1]
-        # 1 in the lanes of a row's last vector that the one before does not cover; a single 1 for short rows.
-        keep = np.zeros(16, np.float32)
-        keep[-(dim % 16) if dim > 16 else -1 :] = 1
         thread_count()
-        blocks, known = -(-len(rows) // _BLOCK), (memory, keep, self._travelled, drift)
-        _check_kernel(dim)(blocks, x.ravel(), rows, codebook.ravel(), *known, result)
+        blocks = -(-len(rows) // _BLOCK)
+        check = _check_kernel(x.shape[1])
+        check(blocks, x.ravel(), rows, codebook.ravel(), memory, self._travelled, drift, result)
         unsure = np.flatnonzero(result < 0)
         if 2 * len(unsure) > len(rows):  # codes have jumped; a new snapshot spares the next searches the cost
             drift = self._take_snapshot(codebook, drift)

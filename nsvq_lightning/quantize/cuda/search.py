@@ -21,6 +21,7 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quantize.box_search import ROUNDING
+from nsvq_lightning.quantize.scores import LIST
 
 
 @triton.jit
@@ -75,7 +76,6 @@ def nearest_kernel(
 
 ROWS = 8  # rows per program of a search
 CODES = 128  # codes that it compares its rows with at a time
-LIST = 8  # codes in the list of a row
 BLOCK = 64  # rows, or codes, per program of a check
 COPIED = 1024  # numbers per program of a copy
 PROGRAMS = 4096  # most programs of a search; they share the queue, whatever its length

@@ -146,7 +146,7 @@ def _check(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> None:
 
 
 def substitute(
-    seed: int, x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, *, aim: float = 0.0, spread: float = 1.0
+    seed: int, x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, *, aim: float, spread: float
 ) -> Tensor:
     """``x + ‖x − c‖·d/‖d‖`` with ``d = aim·(c − x) + spread·v``, v ~ N(0, I), for some rows of a table, ``[V, D]``.
 
