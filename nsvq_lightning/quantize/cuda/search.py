@@ -13,6 +13,8 @@ of :mod:`nsvq_lightning.quantize.tracking`; here rows of any dimension have a li
 be searched is known to the GPU alone: it queues them and works the queue off, and the host reads nothing back.
 """
 
+from typing import Any
+
 import torch
 import triton
 import triton.language as tl
@@ -286,7 +288,7 @@ class DeviceTracker:
         self.num_codes, self.dim, self.device = num_codes, dim, device
         self._memory = empty_memory(0, dim, device)
         self._steps = 0
-        self._snapshot: Tensor | None = None
+        self._snapshot: Any = None  # until the first search
         self._travelled = torch.zeros(1, dtype=torch.float64, device=device)
         self._squared_drift = torch.zeros(1, dtype=torch.int32, device=device)
 

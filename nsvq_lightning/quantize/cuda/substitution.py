@@ -267,7 +267,8 @@ def _remembered(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
     if known != state:
         found = sorted_by_code(codes, num_codes)
         _sorted[codes] = state, found
-    return found
+    order, starts = found
+    return order, starts
 
 
 def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) -> Tensor:
