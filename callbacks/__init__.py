@@ -12,7 +12,6 @@ from .outputs import ExportScene, LiveScene, RenderWriter
 from .progress import SplatProgressBar
 from .pruning import OpacityRegularization, SplatSelection
 from .quantization import (
-    CanonicalCovariance,
     CodebookInit,
     CodebookRefit,
     CodebookReplacement,
@@ -28,7 +27,6 @@ __all__ = [
     "OPTIONAL",
     "STANDARD",
     "BudgetedGrowth",
-    "CanonicalCovariance",
     "CodebookInit",
     "CodebookRefit",
     "CodebookReplacement",
