@@ -25,6 +25,20 @@ from nsvq_lightning.compute import kernel_cache
 
 log = logging.getLogger(__name__)
 
+# What this module has made; a user's own functions are none of its business.
+_ours: WeakSet[Any] = WeakSet()
+# The process that has started threads.
+_started: list[int] = []
+_OPTIONS: dict[str, Any] = {
+    # Products and sums may fuse; NaN and infinity keep their meaning because this package's guards rely on them.
+    "fastmath": {"contract", "nsz"},
+    "error_model": "numpy",
+    "boundscheck": False,
+    "nogil": True,
+    "no_cfunc_wrapper": True,
+}
+_byte_p, _i64 = ir.IntType(8).as_pointer(), ir.IntType(64)
+
 
 class _Compilations(event.Listener):
     """Times Numba's compilations, says so of the first, and has LLVM optimise helpers at a low level.
@@ -64,8 +78,6 @@ class _Compilations(event.Listener):
             self.seconds += time.perf_counter() - self.since
 
 
-# What this module has made; a user's own functions are none of its business.
-_ours: WeakSet[Any] = WeakSet()
 _compilations = _Compilations()
 event.register("numba:compile", _compilations)
 
@@ -82,10 +94,6 @@ class _Cache(kernel_cache.KernelCache):
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         _start_threads()
         return super()._load_overload(sig, target_context)
-
-
-# The process that has started threads.
-_started: list[int] = []
 
 
 @functools.cache
@@ -113,15 +121,6 @@ def check_threads() -> None:
 # Type of the numeric literals in kernels; Python floats would promote their operands to float64.
 F = np.float32
 
-_OPTIONS: dict[str, Any] = {
-    # Products and sums may fuse; NaN and infinity keep their meaning because this package's guards rely on them.
-    "fastmath": {"contract", "nsz"},
-    "error_model": "numpy",
-    "boundscheck": False,
-    "nogil": True,
-    "no_cfunc_wrapper": True,
-}
-
 
 def inline(function: Callable[..., Any]) -> Any:
     """Compile a helper that only other kernels call."""
@@ -146,7 +145,6 @@ def kernel(function: Callable[..., Any], allocates: bool = True) -> Any:
     return dispatcher
 
 
-_byte_p, _i64 = ir.IntType(8).as_pointer(), ir.IntType(64)
 # What Numba's threads call, with where a range of parts begins and how many it has.
 _RANGE = ir.FunctionType(ir.VoidType(), [_byte_p.as_pointer(), _i64.as_pointer(), _i64.as_pointer(), _byte_p])
 _PARALLEL_FOR = ir.FunctionType(ir.VoidType(), [_byte_p] * 5 + [_i64] * 3)

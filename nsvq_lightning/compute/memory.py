@@ -17,6 +17,9 @@ Array = np.ndarray[Any, np.dtype[Any]]
 
 FLOAT32, INT32, INT64, UINT8, UINT64 = map(np.dtype, (np.float32, np.int32, np.int64, np.uint8, np.uint64))
 
+# Memory that is free, by size.
+_BUFFERS: list[Array] = []
+
 
 def flat(tensor: Tensor) -> Array:
     """The elements of a CPU tensor in row-major order: its own memory, or a copy where that is not contiguous."""
@@ -108,8 +111,6 @@ class Workspace:
         return self.array(name, rows * columns, dtype).reshape(rows, columns)
 
 
-# By size.
-_BUFFERS: list[Array] = []
 _LOCK = threading.Lock()
 # A buffer of up to this many times the requested size is reused.
 _SLACK = 4

@@ -30,6 +30,9 @@ _f32, _i1, _i8, _i16, _i32, _i64 = ir.FloatType(), *(ir.IntType(bits) for bits i
 _VF, _VI, _VM = (ir.VectorType(kind, WIDTH) for kind in (_f32, _i32, _i1))
 _CONTRACT = ("contract", "nsz")
 
+# Stands for the type of the elements of the first argument.
+_ELEMENT = object()
+
 
 class _VectorType(types.Type):
     """A Numba type that is one LLVM vector register."""
@@ -64,10 +67,6 @@ def _operator(symbol, result, parameters, emit):
     cases = [signature(result, *parameters)]
     infer_global(symbol)(type(f"_{symbol.__name__}", (ConcreteTemplate,), {"cases": cases}))
     lower_builtin(symbol, *parameters)(lambda context, builder, sig, values: emit(builder, *values))
-
-
-# Stands for the type of the elements of the first argument.
-_ELEMENT = object()
 
 
 def _function(result, *parameters):

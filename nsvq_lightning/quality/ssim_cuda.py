@@ -23,6 +23,16 @@ from nsvq_lightning.quality.ssim import SSIM_RADIUS, check_pair, ssim_window
 
 formulas = for_triton(shared)
 
+# The taps of the window, from the middle outwards.
+TAPS, RADIUS = tl.constexpr(tuple(ssim_window()[SSIM_RADIUS:].tolist())), tl.constexpr(SSIM_RADIUS)
+DERIVATIVES = 3
+# Image rows per program: four floats per thread, so that registers suffice for all taps.
+ROWS = 4
+# Floats of each row per program, three to a pixel.
+COLUMNS = 128
+# Number of programs whose sums are added up at a time.
+BLOCK = 1024
+
 
 @triton.jit
 def place(height, length, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
@@ -68,8 +78,6 @@ def store_at(plane, at, values):
     tl.store(place, values, mask=inside)
 
 
-# The taps of the window, from the middle outwards.
-TAPS, RADIUS = tl.constexpr(tuple(ssim_window()[SSIM_RADIUS:].tolist())), tl.constexpr(SSIM_RADIUS)
 WHITE = tl.constexpr(255.0)
 
 
@@ -180,13 +188,6 @@ def gradient_kernel(
 
 
 MOMENTS = 4
-DERIVATIVES = 3
-# Image rows per program: four floats per thread, so that registers suffice for all taps.
-ROWS = 4
-# Floats of each row per program, three to a pixel.
-COLUMNS = 128
-# Number of programs whose sums are added up at a time.
-BLOCK = 1024
 
 
 class _Launch(NamedTuple):

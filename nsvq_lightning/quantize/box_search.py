@@ -21,6 +21,12 @@ from nsvq_lightning.compute.jit import F, inline, kernel, parallel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, INT32, INT64, Array, aligned_empty, check_array, check_table, outside
 from nsvq_lightning.compute.rows import count_outside
 
+# Factor on the bounds, far above the relative rounding error of a float32 distance.
+ROUNDING = 1.0 + 1e-5
+_NO_CODE = np.int32(np.iinfo(np.int32).max)  # label of a lane without a code
+_ROWS = 512  # queries per unit of parallel work; a pass over them hides the latency of one behind the others
+_TASKS = 2048  # capacity for visits to leaves, which are deferred and processed together
+
 
 class Memory(NamedTuple):
     """What is known about rows from their last search.
@@ -52,12 +58,6 @@ class Memory(NamedTuple):
 
 # Beyond this dimension, boxes prune too little, and the scores of :mod:`scores` are faster.
 MAX_DIM = 8
-# Factor on the bounds, far above the relative rounding error of a float32 distance.
-ROUNDING = 1.0 + 1e-5
-
-_NO_CODE = np.int32(np.iinfo(np.int32).max)  # label of a lane without a code
-_ROWS = 512  # queries per unit of parallel work; a pass over them hides the latency of one behind the others
-_TASKS = 2048  # capacity for visits to leaves, which are deferred and processed together
 
 
 @inline

@@ -17,6 +17,12 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, Array, aligned_empty, check_array, check_table
 
+# Codes in the list of a row.
+LIST = 8
+_BEST = LIST + 1  # scores that a row keeps: those of a list, and the smallest of a code outside it
+_GROUP = 6  # rows scored together
+_TILE = 8 * _GROUP  # rows that pass over a chunk of codes while it stays in the L1 cache
+
 
 @parallel
 def _lay_out(block, _, codebook, centre, blocks, halves):
@@ -100,13 +106,7 @@ def squares(dim, a, at_a, b, at_b, keep):
     return total
 
 
-# Codes in the list of a row.
-LIST = 8
-
-_BEST = LIST + 1  # scores that a row keeps: those of a list, and the smallest of a code outside it
 _BEST_ALONE = 4  # scores that a row keeps where no list is requested
-_GROUP = 6  # rows scored together
-_TILE = 8 * _GROUP  # rows that pass over a chunk of codes while it stays in the L1 cache
 _CHUNK = 4  # blocks of 32 codes in a chunk
 
 

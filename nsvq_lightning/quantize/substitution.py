@@ -25,6 +25,9 @@ from nsvq_lightning.compute.memory import INT64, Array, flat_checked, outside, r
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside
 from nsvq_lightning.quantize.scores import new_lanes
 
+_UNIT, _TINY, _MINUS_TWO_LN2 = F(2.0**-24), np.finfo(np.float32).tiny, F(-2 * np.log(2))
+_ROWS = 256  # rows per unit of parallel work; the noise of a row depends only on its position
+
 
 @inline
 def _polynomial(c, t):
@@ -40,8 +43,6 @@ SIN = (-12.471244, 41.342884, -76.614471, 81.599945, -41.341591, 6.283185)
 
 _GOLDEN, _FIRST, _SECOND = (np.uint64(value) for value in MULTIPLIERS)
 _COS, _SIN = (tuple(F(value) for value in each) for each in (COS, SIN))
-_UNIT, _TINY, _MINUS_TWO_LN2 = F(2.0**-24), np.finfo(np.float32).tiny, F(-2 * np.log(2))
-_ROWS = 256  # rows per unit of parallel work; the noise of a row depends only on its position
 
 
 @inline

@@ -24,6 +24,8 @@ from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, Memory, box_se
 from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, closer, new_lanes, score_search, squares
 
+_BLOCK = 256  # rows per unit of parallel work
+
 
 @inline
 def _list_squared(dim, x, at, codebook, lists, start, keep):
@@ -49,9 +51,6 @@ def _settle(dim, x, row, codebook, lists, start, near):
         near &= near - 1
         code, distance = closer(dim, x, row, codebook, code, distance, candidate)
     return code
-
-
-_BLOCK = 256  # rows per unit of parallel work
 
 
 @cache

@@ -25,6 +25,11 @@ from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quantize.box_search import ROUNDING
 from nsvq_lightning.quantize.scores import LIST
 
+ROWS = 8  # rows per program of a search
+CODES = 128  # codes that it compares its rows with at a time
+BLOCK = 64  # rows, or codes, per program of a check
+SLACK = tl.constexpr(ROUNDING)
+
 
 @triton.jit
 def compare(
@@ -76,9 +81,6 @@ def nearest_kernel(
     tl.store(result + row, nearest.to(tl.int64), mask=row < count)
 
 
-ROWS = 8  # rows per program of a search
-CODES = 128  # codes that it compares its rows with at a time
-BLOCK = 64  # rows, or codes, per program of a check
 COPIED = 1024  # numbers per program of a copy
 PROGRAMS = 4096  # most programs of a search; they share the queue, whatever its length
 SNAPSHOT_STEPS = 16  # searches between two snapshots, as on the CPU
@@ -129,7 +131,6 @@ def empty_memory(count: int, dim: int, device: torch.device) -> tuple[Tensor, ..
     return codes, lists, torch.zeros(count, dim, device=device), clearance, limits
 
 
-SLACK = tl.constexpr(ROUNDING)
 LARGEST = tl.constexpr(float(torch.finfo(torch.float32).max))
 
 

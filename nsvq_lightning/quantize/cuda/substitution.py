@@ -22,6 +22,10 @@ TWO_LOG2_E = tl.constexpr(2 / math.log(2))
 ARTANH = tl.constexpr((1 / 11, 1 / 9, 1 / 7, 1 / 5, 1 / 3, 1.0))
 TINY = tl.constexpr(torch.finfo(torch.float32).tiny)
 
+ROWS = 16  # rows of a code that are added up side by side
+PARTS = 8  # most programs that share the rows of one code, so that one of very many is no long tail; a power of two
+PART = 256  # fewest rows of a part, but for the last one
+
 
 @triton.jit
 def log2(x):
@@ -198,11 +202,6 @@ def substitute_backward(
                 **COMPILE,
             )  # fmt: skip
     return grad_x, sum_rows(radials, codes, len(codebook), x.dtype)
-
-
-ROWS = 16  # rows of a code that are added up side by side
-PARTS = 8  # most programs that share the rows of one code, so that one of very many is no long tail; a power of two
-PART = 256  # fewest rows of a part, but for the last one
 
 
 @triton.jit

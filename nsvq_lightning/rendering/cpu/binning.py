@@ -9,6 +9,9 @@ from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES, share
 DIGIT_BITS = 11
 DIGITS = 1 << DIGIT_BITS
 
+# How many splats ahead a box is prefetched.
+AHEAD = 16
+
 
 @inline
 def _count_digits(thread, threads, count, source, low, shift, histogram):
@@ -74,10 +77,6 @@ def tile_range(boxes, place):
     box = np.int64(get(boxes, place))
     x, y = box & 0xFFFF, (box >> 16) & 0xFFFF
     return x, y, x + ((box >> 32) & 0xFFFF), y + (box >> 48)
-
-
-# How many splats ahead a box is prefetched.
-AHEAD = 16
 
 
 @inline

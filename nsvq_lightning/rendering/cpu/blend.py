@@ -31,6 +31,17 @@ BATCH = 128
 BLOCKS = 16
 BLOCK_SIDE = 4
 
+# Planes of the per-thread scratch of the forward pass, with one vector per block: T keeps falling once a pixel is
+# closed, T_LEFT is the transmittance that the image keeps.
+T, T_LEFT, R_SUM, G_SUM, B_SUM, Z_SUM = (256 * plane for plane in range(6))
+# Vectors of one block in the scratch of the backward pass.
+BACK_T, BACK_REST, BACK_RED, BACK_GREEN, BACK_BLUE, BACK_DEPTH, BACK_WEIGHT, BACK_X, BACK_Y = range(0, 16 * 9, 16)
+BLOCK_STATE = 16 * 9
+# Lower bound on the transmittance of closed pixels: far below the threshold, far above denormal numbers.
+TINY = F(1e-20)
+# How many entries ahead a record is prefetched.
+AHEAD = 24
+
 
 def pixel_grid() -> np.ndarray[tuple[int], np.dtype[np.float32]]:
     """Pixel centres in a tile: x of block k at 16·k, y at 256 + 16·k; first x and y of the blocks at 512 and 528."""
@@ -40,13 +51,7 @@ def pixel_grid() -> np.ndarray[tuple[int], np.dtype[np.float32]]:
     return np.concatenate([x.ravel(), y.ravel(), x[:, 0], y[:, 0]]).astype(np.float32)
 
 
-# Planes of the per-thread scratch of the forward pass, with one vector per block: T keeps falling once a pixel is
-# closed, T_LEFT is the transmittance that the image keeps.
-T, T_LEFT, R_SUM, G_SUM, B_SUM, Z_SUM = (256 * plane for plane in range(6))
 FORWARD_SCRATCH = 6 * 256 + (BATCH + 1) * rec.RECORD
-# Vectors of one block in the scratch of the backward pass.
-BACK_T, BACK_REST, BACK_RED, BACK_GREEN, BACK_BLUE, BACK_DEPTH, BACK_WEIGHT, BACK_X, BACK_Y = range(0, 16 * 9, 16)
-BLOCK_STATE = 16 * 9
 BACKWARD_SCRATCH = BLOCKS * BLOCK_STATE
 
 
@@ -156,10 +161,6 @@ def store_color(state, o, color):
     simd.store(state, B_SUM + o, color[2])
 
 
-# Lower bound on the transmittance of closed pixels: far below the threshold, far above denormal numbers.
-TINY = F(1e-20)
-
-
 @inline
 def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
     """Blend a batch into one block; returns the block's bit, or 0 once all its pixels are closed."""
@@ -228,10 +229,6 @@ def write_block(block, corner, size, background, state, planes):
             simd.put(image, 3 * pixel, simd.get(state, R_SUM + s))
             simd.put(image, 3 * pixel + 1, simd.get(state, G_SUM + s))
             simd.put(image, 3 * pixel + 2, simd.get(state, B_SUM + s))
-
-
-# How many entries ahead a record is prefetched.
-AHEAD = 24
 
 
 @inline

@@ -22,6 +22,9 @@ from nsvq_lightning.rendering.formulas import (
 # How many splats ahead the rows of a list are prefetched.
 AHEAD = 32
 
+# Floats in a row of degree-3 coefficients, which is read in whole vectors.
+SH_ROW = 45
+
 
 @inline
 def prefetch_sh(array, ids, start, end, stride, used):
@@ -37,10 +40,6 @@ def prefetch_sh(array, ids, start, end, stride, used):
 def coefficients_of(degree):
     """Floats in an SH row beyond the constant term."""
     return 3 * ((degree + 1) * (degree + 1) - 1)
-
-
-# Floats in a row of degree-3 coefficients, which is read in whole vectors.
-SH_ROW = 45
 
 
 @inline

@@ -25,6 +25,11 @@ from nsvq_lightning.rendering.cuda.projection import Lens
 
 formulas = for_triton(shared)
 
+# Splats whose slots a program adds up: most have a few, and a program for each would have little to do.
+SPLATS = 16
+# Number of slots of one splat that are added up at a time.
+SLOTS = 8
+
 
 @triton.jit
 def tile_pixels(tile, columns, width, height):
@@ -236,12 +241,6 @@ def blend(lens: Lens, records: Tensor, tiles: Tiles, background: Tensor) -> tupl
         columns, lens.width, lens.height, BATCH=32, num_warps=1, **COMPILE,
     )  # fmt: skip
     return image, transmittance, depth, ends
-
-
-# Splats whose slots a program adds up: most have a few, and a program for each would have little to do.
-SPLATS = 16
-# Number of slots of one splat that are added up at a time.
-SLOTS = 8
 
 
 def blend_backward(

@@ -21,6 +21,9 @@ formulas = for_triton(shared)
 # Places of the limits of slopes and of the near plane among the numbers of a camera.
 SLOPES, NEAR = tl.constexpr(15), tl.constexpr(19)
 
+# Splats per program.
+BLOCK = 128
+
 
 @triton.jit
 def row_of(view, k):
@@ -46,8 +49,6 @@ def load_geometry(means, quats, scales, row, mask):
     return load3(means + 3 * row, mask), (w, x, y, z), load3(scales + 3 * row, mask)
 
 
-# Splats per program.
-BLOCK = 128
 # Passed as the SH degree where no record is wanted.
 RADIUS_ONLY = -1
 
