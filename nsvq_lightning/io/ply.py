@@ -95,14 +95,20 @@ _TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8", "half": "f2", "float16": "f2"},
 }
-# Bits of the numbers in each property of a compressed ``.ply``, the last one in the lowest; opacities are in colours.
+# Lowest bit and largest value of the numbers in each property of a compressed ``.ply``; opacities are in colours.
 _PACKED = {
-    "packed_position": (11, 10, 11),
-    "packed_rotation": (10, 10, 10),
-    "packed_scale": (11, 10, 11),
-    "packed_color": (8, 8, 8, 8),
+    "packed_position": ((21, 11, 0), (2047, 1023, 2047)),
+    "packed_rotation": ((20, 10, 0), (1023, 1023, 1023)),
+    "packed_scale": ((21, 11, 0), (2047, 1023, 2047)),
+    "packed_color": ((24, 16, 8, 0), (255, 255, 255, 255)),
 }
-_LENGTHS = ["scale_x", "scale_y", "scale_z"]
+# Those between whose values in a chunk the numbers are shares of the way; some files have none of colours.
+_BOUNDS = [
+    f"{end}_{name}"
+    for names in ("xyz", ("scale_x", "scale_y", "scale_z"), "rgb")
+    for end in ("min", "max")
+    for name in names
+]
 # Splats of a compressed ``.ply`` that follow each other and share a row of bounds.
 _CHUNK = 256
 # Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene.
@@ -246,9 +252,7 @@ def _coefficients(colors: Float32s, is_float: bool) -> Float32s:
 def _check_packed(header: PlyHeader) -> None:
     chunk = header.others["chunk"]
     sh = header.others.get("sh")
-    names = [*"xyz", *_LENGTHS, *("rgb" if "min_r" in chunk.properties else "")]
-    bounds = [f"{end}_{name}" for end in ("min", "max") for name in names]
-    expected = [(header, list(_PACKED), "u4"), (chunk, bounds, "f4")]
+    expected = [(header, list(_PACKED), "u4"), (chunk, _bounds(chunk), "f4")]
     if sh:
         expected.append((sh, list(sh.properties), "u1"))
     for table, columns, kind in expected:
@@ -260,6 +264,11 @@ def _check_packed(header: PlyHeader) -> None:
             f"damaged: {header.count} compressed splats, {chunk.count} chunks of 256"
             f"{f', harmonics of {sh.count}' if sh else ''}, {header.encoding}"
         )
+
+
+def _bounds(chunk: PlyHeader) -> list[str]:
+    """Those of :data:`_BOUNDS` that a file has."""
+    return _BOUNDS if "min_r" in chunk.properties else _BOUNDS[:12]
 
 
 def read_ply(path: StrPath) -> CompressedScene:
@@ -351,27 +360,23 @@ def _read_ascii(file: BinaryIO, header: PlyHeader) -> Float64s:
 
 def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, Arrays]:
     """Rows ``[N, D]`` of each attribute of a compressed ``.ply``."""
-    chunks = _table(path, header.others["chunk"])
+    chunk = header.others["chunk"]
+    chunks = _table(path, chunk)
     vertices = _table(path, header)
-    shares = {name: _unpacked(vertices[name], bits) for name, bits in _PACKED.items()}
-
-    def within(parts: Float64s, names: Sequence[str]) -> Float64s:
-        """Shares of the ways from the smallest to the largest values of the chunk, ``[N, 3]``."""
-        bounds = [np.stack([chunks[f"{end}_{name}"] for name in names], axis=1) for end in ("min", "max")]
-        low, high = (_for_each(bound, header.count) for bound in bounds)
-        return low * (1 - parts) + high * parts
-
-    colors = shares["packed_color"][:, :3]
-    if "min_r" in header.others["chunk"].properties:
-        colors = within(colors, "rgb")
+    shares = {name: _unpacked(vertices[name], *places) for name, places in _PACKED.items()}
     largest = (vertices["packed_rotation"] >> 30).astype(np.intp)
     rows: dict[str, Arrays] = {
-        "means": within(shares["packed_position"], "xyz"),
-        "quats": from_smallest_three(largest, (shares["packed_rotation"] - 0.5) * math.sqrt(2)),
-        "scales": within(shares["packed_scale"], _LENGTHS),
+        "means": shares["packed_position"],
+        "scales": shares["packed_scale"],
+        "sh0": shares["packed_color"][:, :3],
         "opacities": logits_of(shares["packed_color"][:, 3]),
-        "sh0": (colors - 0.5) / SH_C0,
+        "quats": from_smallest_three(largest, (shares["packed_rotation"] - 0.5) * math.sqrt(2)),
     }
+    bounds = np.stack([chunks[name] for name in _bounds(chunk)], axis=1)
+    ends = np.split(_for_each(bounds, header.count), bounds.shape[1] // 3, axis=1)
+    for part, low, high in zip(rows.values(), ends[::2], ends[1::2], strict=False):
+        part[:] = low * (1 - part) + high * part
+    rows["sh0"] = (rows["sh0"] - 0.5) / SH_C0
     if sh_degree:
         levels = _table(path, header.others["sh"])
         # Bytes stand for the middles of 256ths, the first and the last for the ends.
@@ -387,17 +392,13 @@ def _table(path: StrPath, header: PlyHeader) -> NDArray[np.void]:
 
 
 def _for_each(bounds: Float32s, count: int) -> Float64s:
-    """The bounds ``[N, 3]`` of each splat from those of chunks."""
+    """The bounds ``[N, ...]`` of each splat from those of chunks."""
     return bounds.repeat(_CHUNK, axis=0)[:count].astype(np.float64)
 
 
-def _unpacked(words: Uint32s, bits: Sequence[int]) -> Float64s:
-    """Numbers of so many bits, the last one in the lowest, as shares of the largest ``[N, len(bits)]``."""
-    shares = np.empty((len(words), len(bits)))
-    for share, size in zip(shares.T[::-1], reversed(bits), strict=True):
-        share[:] = words % (1 << size) / ((1 << size) - 1)
-        words = words >> np.uint32(size)
-    return shares
+def _unpacked(words: Uint32s, lowest: Sequence[int], largest: Sequence[int]) -> Float64s:
+    """Numbers in words ``[N]``, from these bits on, as shares of the largest ``[N, len(lowest)]``."""
+    return (words[:, None] >> np.array(lowest, np.uint32) & np.array(largest, np.uint32)) / largest
 
 
 # The normals of points, which other programs expect, are 0 unless an attribute is called so.
@@ -434,35 +435,26 @@ def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
         Bytes of the file.
     """
     scene = scene.in_morton_order()
-    starts = np.arange(0, len(scene), _CHUNK)
-    bounds: dict[str, Arrays] = {}
-
-    def shares(values: Float32s, names: Sequence[str]) -> Float64s:
-        """Shares of the ways from the smallest to the largest values of the chunk, ``[N, 3]``."""
-        ends = {"min": np.minimum.reduceat(values, starts), "max": np.maximum.reduceat(values, starts)}
-        for end, bound in ends.items():
-            bounds.update({f"{end}_{name}": bound[:, axis] for axis, name in enumerate(names)})
-        low, high = (_for_each(bound, len(values)) for bound in ends.values())
-        return (values - low) / np.where(high > low, high - low, 1)
-
-    largest, others = smallest_three(unit(scene.rows("quats")))
     colors = np.asarray(0.5 + SH_C0 * scene.rows("sh0"), np.float32)
+    values = np.stack([scene.means, scene.rows("scales").clip(-20, 20), colors], axis=1)
+    starts = np.arange(0, len(scene), _CHUNK)
+    bounds = np.stack([each.reduceat(values, starts) for each in (np.minimum, np.maximum)], axis=2)
+    low, high = np.moveaxis(_for_each(bounds, len(scene)), 2, 0)
+    shares = (values - low) / np.where(high > low, high - low, 1)
+    largest, others = smallest_three(unit(scene.rows("quats")))
     parts = {
-        "packed_position": shares(scene.means, "xyz"),
+        "packed_position": shares[:, 0],
         "packed_rotation": others / math.sqrt(2) + 0.5,
-        "packed_scale": shares(scene.rows("scales").clip(-20, 20), _LENGTHS),
-        "packed_color": np.c_[shares(colors, "rgb"), opacity_of(scene.opacities)],
+        "packed_scale": shares[:, 1],
+        "packed_color": np.c_[shares[:, 2], opacity_of(scene.opacities)],
     }
-    words = {name: _packed(parts[name], bits) for name, bits in _PACKED.items()}
+    words = {name: _packed(parts[name], *places) for name, places in _PACKED.items()}
     words["packed_rotation"] |= largest.astype(np.uint32) << 30
-    tables = {"chunk": bounds, "vertex": words}
+    tables = {"chunk": dict(zip(_BOUNDS, bounds.reshape(len(starts), -1).T, strict=True)), "vertex": words}
     if scene.sh_degree:
         levels = np.clip(32 * _by_color(scene.rows("shN")) + 128, 0, 255).astype(np.uint8)
         tables["sh"] = dict(zip(splat_columns(scene.sh_degree)["shN"], levels.T, strict=True))
-    elements = {}
-    for name, table in tables.items():
-        columns = [(column, values.dtype) for column, values in table.items()]
-        elements[name] = np.rec.fromarrays(list(table.values()), dtype=columns)
+    elements = {name: np.rec.fromarrays([*table.values()], names=[*table]) for name, table in tables.items()}
     return write_elements(path, elements, scene.antialiased)
 
 
@@ -484,12 +476,10 @@ def write_elements(path: StrPath, elements: Mapping[str, NDArray[np.void]], anti
         return file.tell()
 
 
-def _packed(shares: Float64s, bits: Sequence[int]) -> Uint32s:
-    """Words ``[N]`` of shares ``[N, len(bits)]``, the last one in the lowest bits, as :func:`_unpacked` takes them."""
-    words = np.zeros(len(shares), np.uint32)
-    for share, size in zip(shares.T, bits, strict=True):
-        words = words << np.uint32(size) | np.rint(share.clip(0, 1) * ((1 << size) - 1)).astype(np.uint32)
-    return words
+def _packed(shares: Float64s, lowest: Sequence[int], largest: Sequence[int]) -> Uint32s:
+    """Invert :func:`_unpacked`, to the nearest numbers."""
+    numbers = np.rint(shares.clip(0, 1) * largest).astype(np.uint32)
+    return np.bitwise_or.reduce(numbers << np.array(lowest, np.uint32), axis=1)
 
 
 def plain_ply_bytes(splats: int, sh_degree: int) -> int:
