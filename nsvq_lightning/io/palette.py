@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nsvq_lightning.compute.jit import kernel
+from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import check_array, check_table
 from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s, Integers, Uint8s
 
@@ -94,40 +94,60 @@ def _place_along(rows, weight, numbers, along):  # type: ignore[no-untyped-def]
     """Positions of some rows along the direction in which they differ most; 0 if they are equal."""
     dim = rows.shape[1]
     along[:] = 0
-    mean, product, direction = np.zeros(dim), np.zeros(dim), np.zeros(dim)
-    equal, mass = True, 0.0
+    equal = True
     for i in numbers:
-        mass += weight[i]
         for j in range(dim):
-            mean[j] += weight[i] * rows[i, j]
             equal &= rows[i, j] == rows[numbers[0], j]
     if equal:
         return
-    # The search for the direction starts from the column that varies most.
-    widest = 0
+    mean, direction = mean_and_direction(rows, weight, numbers, 3)
+    for n, i in enumerate(numbers):
+        for j in range(dim):
+            along[n] += (rows[i, j] - mean[j]) * direction[j]
+
+
+@inline
+def mean_and_direction(rows, weight, numbers, steps):  # type: ignore[no-untyped-def]
+    """The mean of some rows, and the direction in which they differ most, by so many steps of power iteration.
+
+    It need not be exact for a cut. Without weights (None), each row counts the same.
+    """
+    # Plain loops: every expression of whole arrays would be a kernel of its own, compiled for a second.
+    dim = rows.shape[1]
+    mean, product, direction = np.zeros(dim), np.zeros(dim), np.zeros(dim)
+    mass = 0.0
+    for i in numbers:
+        each = 1.0 if weight is None else weight[i]
+        mass += each
+        for j in range(dim):
+            mean[j] += each * rows[i, j]
     for j in range(dim):
         mean[j] /= mass
-        for i in numbers:
-            product[j] += weight[i] * (rows[i, j] - mean[j]) ** 2
-        if product[j] > product[widest]:
-            widest = j
-    direction[widest] = 1
-    for _ in range(4):  # steps of power iteration: the direction of a cut need not be exact
-        length = 0.0
-        product[:] = 0
-        for n, i in enumerate(numbers):
-            along[n] = 0
-            for j in range(dim):
-                along[n] += (rows[i, j] - mean[j]) * direction[j]
-            for j in range(dim):
-                product[j] += weight[i] * along[n] * (rows[i, j] - mean[j])
+    # The search starts from the column that varies most.
+    for i in numbers:
+        each = 1.0 if weight is None else weight[i]
         for j in range(dim):
-            length += product[j] ** 2
-        length = np.sqrt(length)
+            product[j] += each * (rows[i, j] - mean[j]) ** 2
+    direction[np.argmax(product)] = 1
+    for _ in range(steps):
+        product[:] = 0
+        for i in numbers:
+            along = 0.0
+            for j in range(dim):
+                along += (rows[i, j] - mean[j]) * direction[j]
+            if weight is not None:
+                along *= weight[i]
+            for j in range(dim):
+                product[j] += along * (rows[i, j] - mean[j])
+        squared = 0.0
+        for j in range(dim):
+            squared += product[j] ** 2
+        length = np.sqrt(squared)
         if not length > 0:
-            return
+            break
         for j in range(dim):
             direction[j] = product[j] / length
+    return mean, direction
 
 
 def in_order_of_use(rows: Float32s, labels: Integers) -> tuple[Float32s, Int64s]:

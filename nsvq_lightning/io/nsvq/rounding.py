@@ -17,6 +17,7 @@ from nsvq_lightning.io.morton import Grid
 from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.io.numbers import coarsest_power, nearest_power, opacity_of
+from nsvq_lightning.io.palette import mean_and_direction
 from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s, Integers, unit
 
 # Coefficients and integers of a basis are below it in size: float32 has them, and 45 products add up to less than 2^52.
@@ -196,56 +197,21 @@ _ITERATIONS = 4
 
 @kernel
 def _cut(rows, order):  # type: ignore[no-untyped-def]
-    # Plain loops: every expression of whole arrays would be a kernel of its own, compiled for a second.
-    dim = rows.shape[1]
     starts, ends = np.empty(128, np.int64), np.empty(128, np.int64)
     starts[0], ends[0] = 0, len(rows)
     waiting = 1
-    center = np.empty(dim)
-    direction = np.empty(dim)
-    product = np.empty(dim)
     while waiting > 0:
         waiting -= 1
         start, end = starts[waiting], ends[waiting]
         if end - start < 2:
             continue
-        center[:] = 0
-        for i in range(start, end):
-            for j in range(dim):
-                center[j] += rows[order[i], j]
-        for j in range(dim):
-            center[j] /= end - start
-        # The search for the direction starts from the column that varies most.
-        product[:] = 0
-        for i in range(start, end):
-            for j in range(dim):
-                product[j] += (rows[order[i], j] - center[j]) ** 2
-        direction[:] = 0
-        direction[np.argmax(product)] = 1
-        for _ in range(_ITERATIONS):
-            product[:] = 0
-            for i in range(start, end):
-                along = 0.0
-                for j in range(dim):
-                    along += (rows[order[i], j] - center[j]) * direction[j]
-                for j in range(dim):
-                    product[j] += (rows[order[i], j] - center[j]) * along
-            squared = 0.0
-            for j in range(dim):
-                squared += product[j] ** 2
-            length = np.sqrt(squared)
-            if not length > 0:
-                break
-            for j in range(dim):
-                direction[j] = product[j] / length
-        projections = np.empty(end - start)
-        for i in range(start, end):
-            along = 0.0
-            for j in range(dim):
-                along += rows[order[i], j] * direction[j]
-            projections[i - start] = along
-        places = np.argsort(projections, kind="mergesort")
         before = order[start:end].copy()
+        _, direction = mean_and_direction(rows, None, before, _ITERATIONS)
+        projections = np.zeros(end - start)
+        for i in range(end - start):
+            for j in range(rows.shape[1]):
+                projections[i] += rows[before[i], j] * direction[j]
+        places = np.argsort(projections, kind="mergesort")
         for i in range(end - start):
             order[start + i] = before[places[i]]
         middle = start + (end - start + 1) // 2
