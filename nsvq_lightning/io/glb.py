@@ -47,9 +47,9 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
     """
     scene = rotated(scene, HALF_TURN)
     opacities = opacity_of(scene.opacities)
-    sh0 = scene.rows("sh0")
+    colors = np.concatenate([scene.values("sh0"), scene.values("shN")], axis=1)
     # The fallback is linear light; what the splats have is meant for display.
-    shown = np.clip(0.5 + SH_C0 * sh0.astype(np.float64), 0, 1)
+    shown = np.clip(0.5 + SH_C0 * colors[:, 0].astype(np.float64), 0, 1)
     linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     arrays: dict[str, Arrays] = {
         "POSITION": scene.means,
@@ -57,10 +57,8 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
         f"{EXTENSION}:ROTATION": unit(scene.rows("quats"))[:, [1, 2, 3, 0]].astype(np.float32),
         f"{EXTENSION}:SCALE": np.exp(scene.rows("scales")),
         OPACITY: opacities.astype(np.float32)[:, None],
-        _harmonic(0): sh0,
+        **{_harmonic(number): colors[:, number] for number in range(colors.shape[1])},
     }
-    for number, coefficients in enumerate(scene.values("shN").swapaxes(0, 1), 1):
-        arrays[_harmonic(number)] = coefficients
     kinds = {width: name for name, width in _WIDTHS.items()}
     views: list[Json] = []
     accessors: list[Json] = []
@@ -131,9 +129,9 @@ def read_glb(path: StrPath) -> CompressedScene:
                 used = ", ".join(map(str, document.get("extensionsUsed", ()))) or "none"
                 raise FormatError(f"no primitive has the extension {EXTENSION}; used are: {used}", "export splats so")
             return rotated(CompressedScene.joined(parts), HALF_TURN)
+        except FormatError:
+            raise
         except (KeyError, TypeError, IndexError, AttributeError, ValueError, RecursionError) as error:
-            if isinstance(error, FormatError):
-                raise
             raise FormatError(f"of a kind that is not read, or altered: {error!r}", "save it as a plain .glb") from None
 
 
@@ -246,9 +244,9 @@ def _accessor(document: Json, data: memoryview, number: int) -> Float32s:
     start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
     row = width * dtype.itemsize
     stride = view.get("byteStride", row)
-    if type(count) is not int or count < 0 or start < 0 or stride < row:
+    if start < 0 or stride < row:
         raise ValueError(f"accessor {number} is out of range")
-    if count and start + (count - 1) * stride + row > len(data):
+    if start + (count - 1) * stride + row > len(data):
         raise FormatError(f"truncated: accessor {number} ends beyond the file")
     rows = np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize)).astype(np.float32)
     if dtype.kind != "f" and accessor.get("normalized"):

@@ -27,7 +27,7 @@ class Grid:
     """
 
     step: float
-    base: tuple[int, int, int]
+    base: tuple[int, ...]
 
     @classmethod
     def around(cls, means: Float32s, widest: Float64s) -> Self:
@@ -45,8 +45,8 @@ class Grid:
         # Cells up to a quarter of the grid lie on multiples of their own width, whichever scene it was made for.
         quarter = 1 << AXIS_BITS - 2
         middle = (low + high) / 2 / step
-        x, y, z = np.rint((middle - 2 * quarter) / quarter).tolist()
-        return cls(step, (int(x) * quarter, int(y) * quarter, int(z) * quarter))
+        base = np.rint((middle - 2 * quarter) / quarter).astype(np.int64) * quarter
+        return cls(step, tuple(base.tolist()))
 
     def cells(self, means: Float32s) -> tuple[Int64s, Bools]:
         """Cell of each position ``[N, 3]``, 0 for those outside; and which ``[N]`` are inside."""

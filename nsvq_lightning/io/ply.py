@@ -119,26 +119,25 @@ _MAX_HEADER = 1 << 26
 
 def _parsed(file: BinaryIO) -> PlyHeader:
     """Header of a file."""
-    start = file.read(1 << 16)
-    if not re.match(rb"ply[ \t]*\r?\n", start):
+    start = file.readline(1 << 16)
+    if not re.fullmatch(rb"ply[ \t]*\r?\n", start):
         raise wrong_start(".ply", start, b"ply")
-    while (end := re.search(rb"\nend_header[ \t]*\r?\n", start)) is None and len(start) < _MAX_HEADER:
-        if not (more := file.read(len(start))):
-            break
-        start += more
-    if end is None:
-        raise FormatError("truncated or damaged: the header has no end_header line")
-    lines = [line.split() for line in start[: end.start()].decode("latin-1").split("\n")[1:]]
-    formats = [line[1] for line in lines if line and line[0] == "format" and len(line) > 1]
+    lines: list[list[str]] = []
+    while lines[-1:] != [["end_header"]]:
+        line = file.readline(_MAX_HEADER)
+        if not line.endswith(b"\n") or file.tell() > _MAX_HEADER:
+            raise FormatError("truncated or damaged: the header has no end_header line")
+        lines.append(line.decode("latin-1").split())
+    formats = [line[1] for line in lines if line[:1] == ["format"] and len(line) > 1]
     if len(formats) != 1 or formats[0] not in _BYTE_ORDER:
         raise FormatError(f"the header needs one format line with {', '.join(_BYTE_ORDER)}; got {formats}")
-    elements = _elements(lines, formats[0], end.end(), file)
+    elements = _elements(lines, formats[0], file)
     if "vertex" not in elements:
         raise FormatError("the header has no element vertex")
     antialiased = False
     meaning = {key.lower(): value for key, value in _MIP_COMMENTS.items()}
-    for line in lines:  # the last comment that says how the splats were trained counts
-        match line:
+    for words in lines:  # the last comment that says how the splats were trained counts
+        match words:
             case ["comment", key, value] if key.lower() in meaning:
                 antialiased = meaning[key.lower()] == value.lower()
     return replace(elements.pop("vertex"), antialiased=antialiased, others=elements)
@@ -148,13 +147,14 @@ def _parsed(file: BinaryIO) -> PlyHeader:
 _PREFIXES = "^(scalar_|scal_)+"
 
 
-def _elements(lines: list[list[str]], encoding: str, offset: int, file: BinaryIO) -> dict[str, PlyHeader]:
+def _elements(lines: list[list[str]], encoding: str, file: BinaryIO) -> dict[str, PlyHeader]:
     """The elements by name up to the first list after the vertices, whose length varies."""
+    offset = file.tell()
     order = _BYTE_ORDER[encoding]
     fields: list[tuple[str, int, list[tuple[str, ...]]]] = []
     for line in lines:
         match line:
-            case [] | ["comment" | "obj_info" | "format", *_]:
+            case [] | ["comment" | "obj_info" | "format" | "end_header", *_]:
                 pass
             case ["element", name, number] if re.fullmatch(r"[0-9]{1,15}", number):
                 fields.append((name, int(number), []))
@@ -338,10 +338,9 @@ def read_ply_columns(
             return
         for start in range(0, header.count, _ROWS):
             rows = min(_ROWS, header.count - start)
-            data = file.read(rows * header.dtype.itemsize)
-            if len(data) < rows * header.dtype.itemsize:
+            table = np.fromfile(file, header.dtype, rows)
+            if len(table) < rows:
                 raise FormatError("truncated while it was read")
-            table = np.frombuffer(data, header.dtype)
             yield np.stack([table[name] for name in names], axis=1, dtype=dtype, casting="unsafe")
 
 

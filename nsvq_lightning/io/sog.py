@@ -27,7 +27,6 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -393,7 +392,8 @@ _PICTURES = (".webp", ".png")
 def _archived(path: Path) -> tuple[bytes, int]:
     """The zip archive and its size; of a folder, whose ``meta.json`` is given, one with the pictures in it."""
     if path.suffix.lower() != ".json":
-        return path.read_bytes(), path.stat().st_size
+        data = path.read_bytes()
+        return data, len(data)
     buffer = io.BytesIO()
     text = path.read_text(encoding="utf-8", errors="replace")
     pictures = [each for each in path.parent.glob("*.*") if each.suffix.lower() in _PICTURES and each.name in text]
@@ -426,5 +426,5 @@ def read_sog(path: StrPath) -> CompressedScene:
             raw["shN"] = np.zeros((archive.count, 0), np.float32)
         antialiased = archive.meta.get("model") == "antialiased" or archive.meta.get("antialias") is True
         config = {"antialiased": True} if antialiased else {}
-        scene = CompressedScene(archive.means(), opacities, codes, codebooks, raw, archive.sh_degree, config)
-        return replace(scene, stored_bytes=size)
+        degree = archive.sh_degree
+        return CompressedScene(archive.means(), opacities, codes, codebooks, raw, degree, config, stored_bytes=size)

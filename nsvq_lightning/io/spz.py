@@ -35,7 +35,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -152,20 +151,19 @@ def _unpack(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
     start = offset + _ENTRY.size * streams
     if not _HEAD <= offset <= start <= len(data):
         raise FormatError(f"truncated or damaged: a table of {streams} streams at {offset}, of {len(data)} bytes")
-    ends = [start]
+    end = start
+    parts = {}
     entries = zip(header.streams.items(), _ENTRY.iter_unpack(data[offset:start]), strict=True)
     for (name, expected), (length, size) in entries:
         # One byte of Zstandard expands to 32 KiB at most: a block of 128 KiB of equal bytes takes four.
         if size != expected or size > length << 15:
             raise FormatError(f"damaged: {name} of {header.count} splats cannot be {size} bytes in {length}")
-        ends.append(ends[-1] + length)
-    if ends[-1] != len(data):
-        raise FormatError(f"truncated or damaged: streams of {ends[-1] - start} bytes in {len(data) - start}")
-    header = _with_axes(header, data[_HEAD:offset])
-    contents = {}
-    for (name, size), (first, end) in zip(header.streams.items(), pairwise(ends), strict=True):
-        contents[name] = zstd_decompress(memoryview(data)[first:end], size)
-    return header, contents
+        parts[name] = memoryview(data)[end : end + length]
+        end += length
+    if end != len(data):
+        raise FormatError(f"truncated or damaged: streams of {end - start} bytes in {len(data) - start}")
+    contents = {name: zstd_decompress(part, header.streams[name]) for name, part in parts.items()}
+    return _with_axes(header, data[_HEAD:offset]), contents
 
 
 def zstd_compress(data: memoryview) -> bytes:
@@ -376,7 +374,7 @@ def _packed_quats(rows: Float32s) -> Uint32s:
     packed = largest.astype("<u4")
     for part in others.T:
         magnitude = np.minimum(np.rint(511 * math.sqrt(2) * np.abs(part)), 511).astype(np.uint32)
-        packed = packed << 10 | np.where(part < 0, np.uint32(512), np.uint32(0)) | magnitude
+        packed = packed << 10 | (part < 0).astype(np.uint32) << 9 | magnitude
     return packed
 
 

@@ -30,13 +30,15 @@ from nsvq_lightning.io.nsvq import entropy, rounding
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 from nsvq_lightning.io.nsvq.precision import MAX_OPACITY_LEVELS, Precision
 from nsvq_lightning.io.nsvq.rounding import leaf_paths
-from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
+from nsvq_lightning.splats.attributes import QUANTIZABLE
 from nsvq_lightning.splats.conventions import Int32s, Int64s, Uint64s
 
 # Attributes by when their streams come; the cells of the positions, which are between, follow from the early ones.
 _EARLY = ("opacities", "scales")
 _LATE = tuple(name for name in QUANTIZABLE if name != "scales")
 _ORDER = (*_EARLY, "means", *_LATE)
+# The last take the longest, and the longest task should not begin last.
+_LONGEST_FIRST = _LATE[::-1]
 _GRID = struct.Struct("<qqqd")
 
 
@@ -51,21 +53,19 @@ def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header
         ValueError: A value is too large for its step.
     """
     with _workers() as pool:
-        tasks = {name: pool.submit(rounding.rounded, scene, name, precision) for name in (*_EARLY, *_largest_first())}
+        tasks = {name: pool.submit(rounding.rounded, scene, name, precision) for name in (*_EARLY, *_LONGEST_FIRST)}
         early = {name: tasks[name].result() for name in _EARLY}
         grid, doublings, depths = rounding.position_grid(scene.means, early, precision)
         cells, inside = grid.cells(scene.means)
         keys = morton.morton_keys(cells, depths)
-        # The order of the file: along the Morton curve, the far splats at the end.
-        near = np.flatnonzero(inside)
-        near = near[np.argsort(keys[near], kind="stable")]
-        far = np.flatnonzero(~inside)
-        order = np.concatenate([near, far])
+        # The order of the file: along the Morton curve, the far splats, whose keys are 0, at the end.
+        order = np.lexsort([keys, ~inside])
+        near, far = np.split(order, [np.count_nonzero(inside)])
         keys, depths = keys[near], depths[near]
         writing = [pool.submit(_encoded, early[name], order, _before(len(order))) for name in _EARLY]
         positions = pool.submit(entropy.encode_keys, keys, 3 * depths)
         neighbours = _neighbours(keys, depths, len(order))
-        writing += [pool.submit(_encoded, tasks[name].result(), order, neighbours) for name in _largest_first()]
+        writing += [pool.submit(_encoded, tasks[name].result(), order, neighbours) for name in _LONGEST_FIRST]
         streams = {
             "means": positions.result(),
             "means.grid": _GRID.pack(*grid.base, doublings),
@@ -91,7 +91,7 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
     *base, doublings = _GRID.unpack(streams["means.grid"])
     if not math.isfinite(doublings):
         raise FormatError(f"damaged: the cells of the positions have {doublings} doublings, not a finite number")
-    grid = morton.Grid(entries["means"].step, (base[0], base[1], base[2]))
+    grid = morton.Grid(entries["means"].step, tuple(base))
     far = np.frombuffer(streams["means.far"], "<f4").astype(np.float32).reshape(-1, 3)
     with _workers() as pool:
         early = {name: pool.submit(_decoded, entries[name], streams, _before(header.splats)) for name in _EARLY}
@@ -99,7 +99,7 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
         depths = grid.depths(rounding.doublings_of(stored, doublings))[: header.splats - len(far)]
         keys = entropy.decode_keys(streams["means"], 3 * depths)
         neighbours = _neighbours(keys, depths, header.splats)
-        late = {name: pool.submit(_decoded, entries[name], streams, neighbours) for name in _largest_first()}
+        late = {name: pool.submit(_decoded, entries[name], streams, neighbours) for name in _LONGEST_FIRST}
         means = np.concatenate([grid.centers(morton.unmorton(keys), depths), far])
         stored |= {name: late[name].result() for name in _LATE}
     levels = stored.pop("opacities")
@@ -115,11 +115,6 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
             raw[name] = attribute.floats()
     opacities = rounding.logits_of_levels(levels.entry.codes)[levels.values]
     return CompressedScene(means, opacities, codes, codebooks, raw, bases=bases, **header.of_scene)
-
-
-def _largest_first() -> list[str]:
-    """The late attributes by the time they take: the longest task should not begin last."""
-    return sorted(_LATE, key=attribute_dims(3).__getitem__, reverse=True)
 
 
 def _workers() -> ThreadPoolExecutor:
@@ -203,8 +198,7 @@ _FAR_BYTES = 12
 
 def _check_tables(header: Header) -> None:
     """Compare with the tables this release would write, before anything is allocated from their sizes."""
-    dims = attribute_dims(header.sh_degree)
-    header.check_attributes({name: dims[name] for name in _ORDER}, _possible)
+    header.check_attributes(_ORDER, _possible)
     if [(stream.name, stream.encoding) for stream in header.streams] != _stream_names(header.attributes):
         raise FormatError("damaged: the stream table does not fit the attribute table")
     lengths = {stream.name: stream.length for stream in header.streams}

@@ -97,8 +97,8 @@ def decode(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene
     raise FormatError(f"level {header.level!r}; this release reads {', '.join(LEVELS)}", "update nsvq-lightning")
 
 
-# Rows per chunk: a multiple of 8, so that every chunk ends on a whole byte, and small enough for the cache.
-_CHUNK = 1 << 14
+# Attributes in file order.
+_ORDER = ("means", "opacities", *QUANTIZABLE)
 
 
 def pack_fields(fields: Sequence[Integers], widths: Sequence[int]) -> bytes:
@@ -114,14 +114,11 @@ def pack_fields(fields: Sequence[Integers], widths: Sequence[int]) -> bytes:
     Returns:
         ⌈N · Σ widths / 8⌉ bytes.
     """
-    chunks = []
-    for start in range(0, len(fields[0]), _CHUNK):
-        columns = []
-        for field, width in zip(fields, widths, strict=True):
-            number_bytes = field[start : start + _CHUNK, None].astype("<u4").view(np.uint8)
-            columns.append(np.unpackbits(number_bytes, axis=1, count=width, bitorder="little"))
-        chunks.append(np.packbits(np.concatenate(columns, axis=1), bitorder="little").tobytes())
-    return b"".join(chunks)
+    columns = []
+    for field, width in zip(fields, widths, strict=True):
+        number_bytes = field[:, None].astype("<u4").view(np.uint8)
+        columns.append(np.unpackbits(number_bytes, axis=1, count=width, bitorder="little"))
+    return np.packbits(np.concatenate(columns, axis=1), bitorder="little").tobytes()
 
 
 def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) -> list[Uint32s]:
@@ -135,18 +132,13 @@ def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) ->
     Returns:
         One array ``[N]`` per field.
     """
-    packed = np.frombuffer(data, np.uint8)
     record = sum(widths)
-    fields = [np.zeros(rows, np.uint32) for _ in widths]
-    for start in range(0, rows, _CHUNK):
-        count = min(_CHUNK, rows - start)
-        chunk = packed[start * record // 8 :]
-        bits = np.unpackbits(chunk[: _CHUNK * record // 8], count=count * record, bitorder="little")
-        columns = np.split(bits.reshape(count, record), np.cumsum(widths)[:-1], axis=1)
-        for field, column in zip(fields, columns, strict=True):
-            number = np.zeros((count, 32), np.uint8)
-            number[:, : column.shape[1]] = column
-            field[start : start + count] = np.packbits(number, axis=1, bitorder="little").view("<u4")[:, 0]
+    bits = np.unpackbits(np.frombuffer(data, np.uint8), count=rows * record, bitorder="little")
+    fields = []
+    for column in np.split(bits.reshape(rows, record), np.cumsum(widths)[:-1], axis=1):
+        number = np.zeros((rows, 32), np.uint8)
+        number[:, : column.shape[1]] = column
+        fields.append(np.packbits(number, axis=1, bitorder="little").view("<u4")[:, 0])
     return fields
 
 
@@ -161,10 +153,10 @@ def paper_header(scene: CompressedScene) -> Header:
     with bits = ⌈log2 K⌉ (0 for a single row). An attribute that is not quantized adds 4 · N · D instead of its bits and
     its codebook. The header is the 32-byte prefix and the JSON.
     """
+    dims = attribute_dims(scene.sh_degree)
     rows = {name: len(codebook) for name, codebook in scene.codebooks.items()}
     attributes = tuple(
-        AttributeEntry(name, dim, "codes" if name in rows else "raw", rows.get(name, 0))
-        for name, dim in _dims(scene.sh_degree).items()
+        AttributeEntry(name, dims[name], "codes" if name in rows else "raw", rows.get(name, 0)) for name in _ORDER
     )
     return Header.of(scene, "paper", attributes, _layout(len(scene), attributes))
 
@@ -205,12 +197,6 @@ def decode_paper(header: Header, streams: Mapping[str, memoryview]) -> Compresse
         raise FormatError(f"damaged: {error}") from None
 
 
-def _dims(sh_degree: int) -> dict[str, int]:
-    """Values per splat of each attribute, in file order."""
-    dims = attribute_dims(sh_degree)
-    return {name: dims[name] for name in ("means", "opacities", *QUANTIZABLE)}
-
-
 def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> tuple[StreamEntry, ...]:
     """The streams: raw attributes, codes, codebooks."""
     coded = [entry for entry in attributes if entry.storage == "codes"]
@@ -224,7 +210,7 @@ def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> tuple[StreamEntry
 
 def _check_tables(header: Header) -> None:
     """Compare with the tables this release would write, before anything is allocated from their sizes."""
-    header.check_attributes(_dims(header.sh_degree), _possible)
+    header.check_attributes(_ORDER, _possible)
     if header.streams != _layout(header.splats, header.attributes):
         raise FormatError("damaged: the stream table does not fit the attribute table and the number of splats")
 

@@ -11,7 +11,7 @@ import math
 import os
 import struct
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from hashlib import blake2b
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, TypeVar, get_type_hints
 from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, Json, naming_file
+from nsvq_lightning.splats.attributes import attribute_dims
 
 
 class AttributeEntry(NamedTuple):
@@ -114,18 +115,19 @@ class Header:
         """Bytes of the whole file."""
         return self.size + sum(stream.length for stream in self.streams)
 
-    def check_attributes(self, dims: Mapping[str, int], possible: Callable[[AttributeEntry], bool]) -> None:
+    def check_attributes(self, names: Sequence[str], possible: Callable[[AttributeEntry], bool]) -> None:
         """Compare the attribute table with that of a level, before anything is allocated from its sizes.
 
         Args:
-            dims: Values per splat by attribute, in the order of the level.
+            names: The attributes in the order of the level.
             possible: Whether an entry is one of the level.
 
         Raises:
             FormatError: It is another table.
         """
-        if [(entry.name, entry.dim) for entry in self.attributes] != list(dims.items()):
-            raise FormatError(f"damaged: the attribute table must list {', '.join(dims)}, got {self.attributes}")
+        dims = attribute_dims(self.sh_degree)
+        if [(entry.name, entry.dim) for entry in self.attributes] != [(name, dims[name]) for name in names]:
+            raise FormatError(f"damaged: the attribute table must list {', '.join(names)}, got {self.attributes}")
         for entry in self.attributes:
             if not possible(entry):
                 raise FormatError(f"damaged: impossible attribute {entry}")
