@@ -281,22 +281,13 @@ class CompressedScene:
             changes: By attribute, what makes rows ``[.., D]`` others; they are rounded to float32.
             fields: Fields of the scene that change, too.
         """
-
-        def rows(tables: Mapping[str, Float32s]) -> dict[str, Float32s]:
-            found = dict(tables)
-            for name in changes.keys() & tables.keys():
-                found[name] = changes[name](tables[name]).astype(np.float32)
-            return found
-
-        raw = rows({name: values for name, values in self.raw.items() if name not in self.bases})
-        return replace(
-            self,
-            codebooks=rows(self.codebooks),
-            raw={**self.raw, **raw},
-            bases=rows(self.bases),
-            stored_bytes=None,
-            **fields,
-        )
+        codebooks = dict(self.codebooks)
+        bases = dict(self.bases)
+        raw = dict(self.raw)
+        for name, change in changes.items():
+            table = next(each for each in (codebooks, bases, raw) if name in each)
+            table[name] = change(table[name]).astype(np.float32)
+        return replace(self, codebooks=codebooks, raw=raw, bases=bases, stored_bytes=None, **fields)
 
     def with_degree(self, degree: int) -> "CompressedScene":
         """The scene with spherical harmonics up to a degree, 0 to 3: higher ones are left out, missing ones are 0."""

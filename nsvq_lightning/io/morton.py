@@ -73,13 +73,18 @@ def morton_keys(cells: Int64s, depths: Int64s) -> Uint64s:
         ValueError: The arrays are not ``[N, 3]`` and ``[N]``, or not contiguous, or a depth is not in 0 to 21.
         TypeError: They are not int64.
     """
-    check_array("cells", cells, (len(cells), 3), INT64)
-    check_array("depths", depths, (len(cells),), INT64)
-    if depths.size and (depths.min() < 0 or depths.max() > AXIS_BITS):
-        raise outside("depths", depths, AXIS_BITS + 1)
+    check_array("cells", cells, (len(depths), 3), INT64)
+    check_depths(depths, AXIS_BITS)
     keys = np.empty(len(cells), np.uint64)
     _interleave(cells, depths, keys)
     return keys
+
+
+def check_depths(depths: Int64s, largest: int) -> None:
+    """Refuse depths that are not ``[N]`` contiguous int64 in 0 to ``largest``."""
+    check_array("depths", depths, (depths.size,), INT64)
+    if depths.size and (depths.min() < 0 or depths.max() > largest):
+        raise outside("depths", depths, largest + 1)
 
 
 def unmorton(keys: Uint64s) -> Int64s:

@@ -87,8 +87,6 @@ def read_ply_header(path: StrPath) -> PlyHeader:
     return header
 
 
-# Comments of Brush and of Postshot, and the word after each that says: trained with anti-aliasing.
-_MIP_COMMENTS = {"SplatRenderMode:": "mip", "antialiased": "1"}
 _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -135,11 +133,12 @@ def _parsed(file: BinaryIO) -> PlyHeader:
     if "vertex" not in elements:
         raise FormatError("the header has no element vertex")
     antialiased = False
-    meaning = {key.lower(): value for key, value in _MIP_COMMENTS.items()}
     for words in lines:  # the last comment that says how the splats were trained counts
-        match words:
-            case ["comment", key, value] if key.lower() in meaning:
-                antialiased = meaning[key.lower()] == value.lower()
+        match [word.lower() for word in words]:
+            case ["comment", "splatrendermode:", mode]:
+                antialiased = mode == "mip"
+            case ["comment", "antialiased", number]:
+                antialiased = number == "1"
     return replace(elements.pop("vertex"), antialiased=antialiased, others=elements)
 
 
@@ -453,7 +452,10 @@ def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
     if scene.sh_degree:
         levels = np.clip(32 * _by_color(scene.rows("shN")) + 128, 0, 255).astype(np.uint8)
         tables["sh"] = dict(zip(splat_columns(scene.sh_degree)["shN"], levels.T, strict=True))
-    elements = {name: np.rec.fromarrays([*table.values()], names=[*table]) for name, table in tables.items()}
+    elements = {
+        name: np.rec.fromarrays([*table.values()], [(column, values.dtype) for column, values in table.items()])
+        for name, table in tables.items()
+    }
     return write_elements(path, elements, scene.antialiased)
 
 
@@ -478,7 +480,7 @@ def write_elements(path: StrPath, elements: Mapping[str, NDArray[np.void]], anti
 def _packed(shares: Float64s, lowest: Sequence[int], largest: Sequence[int]) -> Uint32s:
     """Invert :func:`_unpacked`, to the nearest numbers."""
     numbers = np.rint(shares.clip(0, 1) * largest).astype(np.uint32)
-    return np.bitwise_or.reduce(numbers << np.array(lowest, np.uint32), axis=1)
+    return (numbers << np.array(lowest, np.uint32)).sum(1, np.uint32)
 
 
 def plain_ply_bytes(splats: int, sh_degree: int) -> int:
@@ -497,8 +499,8 @@ def _header(elements: Mapping[str, tuple[int, np.dtype[np.void]]], antialiased: 
     """Header of a file with rows of elements, so many and of such a kind."""
     kinds = {code: name for name, code in reversed(_TYPES.items())}
     lines = ["ply", "format binary_little_endian 1.0"]
-    if antialiased:
-        lines += [f"comment {key} {value}" for key, value in _MIP_COMMENTS.items()]
+    if antialiased:  # as Brush and Postshot say it
+        lines += ["comment SplatRenderMode: mip", "comment antialiased 1"]
     for name, (count, row) in elements.items():
         lines.append(f"element {name} {count}")
         lines += [f"property {kinds[row[column].str[1:]]} {column}" for column in row.names or ()]

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nsvq_lightning.data.points import projected
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import StrPath, write_text
 from nsvq_lightning.io.nsvq.file import read_nsvq
@@ -119,15 +120,15 @@ def best_view(splats: SplatTensors, cameras: Sequence[Camera]) -> int:
     splats are looked at, evenly spaced.
     """
     step = -(-len(splats.means) // 50_000) or 1
-    means = splats.means.detach()[::step]
-    weights = splats.opacities.detach()[::step].sigmoid()
+    means = splats.means.detach()[::step].double().numpy()
+    weights = splats.opacities.detach()[::step].sigmoid().numpy()
 
     def shown(camera: Camera) -> float:
-        camera = camera.to("cpu", torch.float32)
-        points = (means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]) @ camera.K.T
-        shares = points[:, :2] / points[:, 2:] / torch.tensor([camera.width, camera.height])
-        centrality = (1 - (2 * shares - 1).abs()).clamp(min=0).prod(1)
-        return float((weights * centrality)[points[:, 2] > camera.near].sum())
+        column, row, depth = projected(means, camera.to("cpu"))
+        across = 1 - np.abs(2 * column / camera.width - 1)
+        down = 1 - np.abs(2 * row / camera.height - 1)
+        centrality = across.clip(0) * down.clip(0)
+        return float((weights * centrality)[depth > camera.near].sum())
 
     return max(range(len(cameras)), key=lambda place: shown(cameras[place]))
 

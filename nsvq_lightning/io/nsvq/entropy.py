@@ -10,8 +10,9 @@ import numpy as np
 from numba import uint64
 
 from nsvq_lightning.compute.jit import inline, kernel
-from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array, outside
+from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array
 from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.morton import check_depths
 from nsvq_lightning.io.nsvq import range_coder as rc
 from nsvq_lightning.splats.conventions import Bools, Int32s, Int64s, Uint32s, Uint64s
 
@@ -88,18 +89,12 @@ def encode_keys(keys: Uint64s, depths: Int64s) -> bytes:
         ValueError: The arrays do not fit together, one is not contiguous, or keys do not ascend or are out of range.
         TypeError: A dtype is wrong.
     """
-    _check_depths(depths)
+    check_depths(depths, KEY_BITS)
     check_array("keys", keys, (len(depths),), UINT64)
     if (keys[1:] < keys[:-1]).any() or (len(keys) and keys[-1] > _KEY_MASK):
         raise ValueError(f"keys must ascend and be below 2^{KEY_BITS}, got {keys}; sort them")
     words = _room(int(depths.sum()) + 8 * len(keys))
     return _bytes(words, _write_keys(keys, depths, words, rc.new_contexts(_KEY_CONTEXTS)))
-
-
-def _check_depths(depths: Int64s) -> None:
-    check_array("depths", depths, (depths.size,), INT64)
-    if depths.size and (depths.min() < 0 or depths.max() > KEY_BITS):
-        raise outside("depths", depths, KEY_BITS + 1)
 
 
 def decode_keys(data: bytes | memoryview, depths: Int64s) -> Uint64s:
@@ -110,7 +105,7 @@ def decode_keys(data: bytes | memoryview, depths: Int64s) -> Uint64s:
         ValueError: As for :func:`encode_keys`.
         TypeError: The depths are not int64.
     """
-    _check_depths(depths)
+    check_depths(depths, KEY_BITS)
     keys, words = np.empty(len(depths), np.uint64), _words(data)
     used = _read_keys(words, depths, keys, rc.new_contexts(_KEY_CONTEXTS))
     _check_used(words, used, "a position is outside its grid")
