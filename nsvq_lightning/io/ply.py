@@ -480,7 +480,8 @@ def write_elements(path: StrPath, elements: Mapping[str, NDArray[np.void]], anti
 def _packed(shares: Float64s, lowest: Sequence[int], largest: Sequence[int]) -> Uint32s:
     """Invert :func:`_unpacked`, to the nearest numbers."""
     numbers = np.rint(shares.clip(0, 1) * largest).astype(np.uint32)
-    return (numbers << np.array(lowest, np.uint32)).sum(1, np.uint32)
+    words: Uint32s = np.bitwise_or.reduce(numbers << np.array(lowest, np.uint32), axis=1)
+    return words
 
 
 def plain_ply_bytes(splats: int, sh_degree: int) -> int:

@@ -419,12 +419,12 @@ def read_spz(path: StrPath) -> CompressedScene:
 
 def _unpacked_means(header: SpzHeader, data: Uint8s) -> NDArray[np.floating[Any]]:
     if header.version == 1:
-        return np.ascontiguousarray(data).view("<f2").astype(np.float64)
+        return np.ascontiguousarray(data).view("<f2")
     # Put three bytes at the top of four, then shift down with the sign.
     wide = np.zeros((header.count, 3, 4), np.uint8)
     wide[:, :, 1:] = data.reshape(header.count, 3, 3)
     fixed = wide.view("<i4")[:, :, 0] >> 8
-    return np.ldexp(fixed.astype(np.float64), -header.fraction_bits)
+    return fixed / (1 << header.fraction_bits)
 
 
 def _unpacked_quats(header: SpzHeader, data: Uint8s) -> Float32s:

@@ -87,7 +87,6 @@ def summarize(
     header = read_header(path)
     plain_bytes = plain_ply_bytes(len(scene), scene.sh_degree)
     last = {str(entry["phase"]): dict(entry) for entry in module.history}  # the last evaluation of each phase
-    ends = [last[phase.name.lower()] for phase in Phase if phase.name.lower() in last]
     return {
         **{name: float(sum(score[name] for score in scores)) / len(scores) for name in scored},
         "lpips": lpips[0],
@@ -103,7 +102,7 @@ def summarize(
         "paper_level": dict(paper),
         "train_seconds": module.stopwatch.seconds,
         "before_quantization": last.get(Phase(Phase.QUANTIZE - 1).name.lower()) if scene.codebooks else None,
-        "phases": ends,
+        "phases": list(last.values()),
     }
 
 
@@ -141,8 +140,6 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: Co
     columns = []
     for name, *cells in zip(head, *rows, strict=True):
         width = max(3, *map(len, (name, *cells)))
-        if name in words:
-            columns.append([cell.ljust(width) for cell in (name, "-" * width, *cells)])
-        else:
-            columns.append([cell.rjust(width) for cell in (name, "-" * (width - 1) + ":", *cells)])
+        aligned, end = (str.ljust, "-") if name in words else (str.rjust, ":")
+        columns.append([aligned(cell, width) for cell in (name, aligned(end, width, "-"), *cells)])
     return "\n".join(f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))
