@@ -63,8 +63,7 @@ class SpzHeader:
         sh_degree: Degree of the spherical harmonics, 0 to 4, of which 3 are read.
         fraction_bits: Fractional bits of the positions.
         flags: :data:`ANTIALIASED`, and 2 where extensions follow.
-        axes: Where x, y and z point: right or left, down or up, front or back, by their first letters; empty if the
-            file does not say.
+        system: Number that says where x, y and z point, see :data:`_SYSTEMS`; 0 if the file does not say.
     """
 
     version: int
@@ -72,7 +71,7 @@ class SpzHeader:
     sh_degree: int
     fraction_bits: int
     flags: int = 0
-    axes: str = ""
+    system: int = 0
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -107,11 +106,9 @@ ANTIALIASED, _EXTENDED = 1, 2
 _EXTENSION = struct.Struct("<III")
 # The extension that states the axes.
 _AXES = 0xADBE0003
-# Axes by the number that the extension holds; 0 says nothing.
-_SYSTEMS = (
-    *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
-    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
-)
+# Where x, y and z point by the number that the extension holds, from 1: right or left, down or up, front or back. The
+# next eight, in which z is up or down, become these by a quarter turn.
+_SYSTEMS = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
 # Coordinates that the real spherical harmonics of degree 1 to 3 are odd functions of.
 _ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 
@@ -121,8 +118,8 @@ def _write_frame(path: StrPath, header: SpzHeader, arrays: Mapping[str, Arrays])
     contents = [np.ascontiguousarray(arrays[name]).data.cast("B") for name in header.streams]
     axes = b""
     flags = header.flags
-    if header.axes:
-        axes = _EXTENSION.pack(_AXES, 4, _SYSTEMS.index(header.axes))
+    if header.system:
+        axes = _EXTENSION.pack(_AXES, 4, header.system)
         flags |= _EXTENDED
     count = len(contents) if header.version == 4 else 0
     start = _HEADER.pack(_MAGIC, header.version, header.count, header.sh_degree, header.fraction_bits, flags, count)
@@ -205,12 +202,12 @@ def _with_axes(header: SpzHeader, extensions: bytes) -> SpzHeader:
     while header.flags & _EXTENDED and start + _EXTENSION.size <= len(extensions):
         kind, length, system = _EXTENSION.unpack_from(extensions, start)
         if (kind, length) == (_AXES, 4):
-            if system >= len(_SYSTEMS):
+            if system > 16:
                 raise FormatError(
                     f"damaged, or newer than this release: coordinate system {system}, not 0 to 16",
                     "update nsvq-lightning",
                 )
-            return replace(header, axes=_SYSTEMS[system])
+            return replace(header, system=system)
         start += 8 + length
     return header
 
@@ -328,7 +325,7 @@ def write_spz(
     xyz, quats, harmonics = _signs(axes.upper(), scene.sh_degree)
     fraction = _fraction_bits(scene)
     # Viewers expect version 3 to be silent, in the default axes; Babylon.js turns a scene that says so upside down.
-    stated = axes.upper() if version == 4 or axes != DEFAULT_AXES else ""
+    stated = _SYSTEMS.index(axes.upper()) + 1 if version == 4 or axes != DEFAULT_AXES else 0
     end = 1 << _POSITION - 1
     means = clamped.nearest("means", scene.means * xyz * (1 << fraction), (-end, end - 1))
     arrays: dict[str, Arrays] = {
@@ -392,17 +389,14 @@ def read_spz(path: StrPath) -> CompressedScene:
         name: np.frombuffer(contents.get(name, b""), np.uint8).reshape(header.count, size)
         for name, size in header.sizes.items()
     }
-    if not header.axes:
+    if not header.system:
         advice = "If it is upside down: nsvq convert --up minus-y --up-from 0 1 0"
         logger.info("%s: the file does not say where its axes point; taken as right, down, front. %s", path, advice)
     degree = min(header.sh_degree, 3)
     if header.sh_degree > degree:
         logger.warning("%s: of SH degree %d, degrees up to %d are read", path, header.sh_degree, degree)
-    axes = header.axes or DEFAULT_AXES.upper()
-    turn = axes[1] in "FB"
-    if turn:  # z is up or down: signs first, then a quarter turn, as Niantic's library does it, which writes such files
-        axes = axes[0] + axes[2] + {"F": "B", "B": "F"}[axes[1]]
-    xyz, quats, harmonics = _signs(axes, degree)
+    system = header.system or _SYSTEMS.index(DEFAULT_AXES.upper()) + 1
+    xyz, quats, harmonics = _signs(_SYSTEMS[(system - 1) % 8], degree)
     scene = CompressedScene.from_rows(
         {
             "means": _unpacked_means(header, arrays["means"]) * xyz,
@@ -414,7 +408,8 @@ def read_spz(path: StrPath) -> CompressedScene:
         },
         antialiased=bool(header.flags & ANTIALIASED),
     )
-    return rotated(scene, UP_AXES["z"]) if turn else scene
+    # Signs first, then the turn, as Niantic's library does it, which writes such files.
+    return rotated(scene, UP_AXES["z"]) if system > 8 else scene
 
 
 def _unpacked_means(header: SpzHeader, data: Uint8s) -> NDArray[np.floating[Any]]:
