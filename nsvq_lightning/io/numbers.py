@@ -85,15 +85,11 @@ class Clamped:
             Integers ``[N, ...]``.
         """
         rounded = np.clip(np.rint(values), *ends)
-        self._count(name, np.abs(rounded - values) > 0.5 + _ROUNDING)
+        self.count(name, np.abs(rounded - values) > 0.5 + _ROUNDING)
         return np.asarray(np.nan_to_num(rounded), np.int32)
 
-    def within(self, name: str, values: Float32s, low: float, high: float) -> Float32s:
-        """Values ``[N, ...]`` clamped to [``low``, ``high``]; ``name`` is that of :meth:`nearest`."""
-        self._count(name, (values < low) | (values > high))
-        return np.clip(values, low, high)
-
-    def _count(self, name: str, beyond: Bools) -> None:
+    def count(self, name: str, beyond: Bools) -> None:
+        """Count the splats with any values ``[N, ...]`` of an attribute that are beyond its range."""
         rows = beyond.any(tuple(range(1, beyond.ndim)))
         self._counts[name] += int(rows.sum())
 

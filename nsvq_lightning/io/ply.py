@@ -89,10 +89,17 @@ def read_ply_header(path: StrPath) -> PlyHeader:
 
 _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
-    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8", "half": "f2", "float16": "f2"},
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "half": "f2",
+    "float": "f4",
+    "double": "f8",
 }
+_TYPES |= {np.dtype(code).name: code for code in _TYPES.values()}  # int8, ...
 # Lowest bit and largest value of the numbers in each property of a compressed ``.ply``; opacities are in colours.
 _PACKED = {
     "packed_position": ((21, 11, 0), (2047, 1023, 2047)),

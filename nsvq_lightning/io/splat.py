@@ -43,8 +43,11 @@ def write_splat(path: StrPath, scene: CompressedScene) -> int:
     clamped = Clamped()
     records = np.empty(len(scene), _RECORD)
     records["means"] = scene.means
+    scales = scene.rows("scales")
     # Between the smallest and the largest length that float32 holds with full precision.
-    records["lengths"] = np.exp(clamped.within("scales", scene.rows("scales"), -87.0, 88.0))
+    held = scales.clip(-87.0, 88.0)
+    clamped.count("scales", held != scales)
+    records["lengths"] = np.exp(held)
     colors = 255 * (0.5 + SH_C0 * scene.rows("sh0"))
     records["colors"][:, :3] = clamped.nearest("sh0", colors, (0, 255))
     records["colors"][:, 3] = bytes_of(scene.opacities)

@@ -16,7 +16,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.morton import Grid
 from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
-from nsvq_lightning.io.numbers import coarsest_power, nearest_power, opacity_of
+from nsvq_lightning.io.numbers import coarsest_power, logits_of, nearest_power, opacity_of
 from nsvq_lightning.io.palette import mean_and_direction
 from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s, Integers, unit
 
@@ -109,8 +109,7 @@ def _integers(name: str, rows: Float32s, step: float, limit: float = 2.0**52) ->
 
 def logits_of_levels(count: int) -> Float32s:
     """Logit ``[count]`` of the middle of each level."""
-    shares = (np.arange(count) + 0.5) / count
-    return (np.log(shares) - np.log1p(-shares)).astype(np.float32)
+    return logits_of((np.arange(count) + 0.5) / count)
 
 
 # Positions
