@@ -51,7 +51,7 @@ class Grid:
     def cells(self, means: Float32s) -> tuple[Int64s, Bools]:
         """Cell of each position ``[N, 3]``, 0 for those outside; and which ``[N]`` are inside."""
         cells = np.floor(means.astype(np.float64) / self.step) - np.array(self.base, np.float64)
-        inside = ((cells >= 0) & (cells < 1 << AXIS_BITS)).all(1)
+        inside = np.logical_and.reduce((cells >= 0) & (cells < 1 << AXIS_BITS), axis=1)
         return np.where(inside[:, None], cells, 0).astype(np.int64), inside
 
     def depths(self, doublings: Float64s) -> Int64s:

@@ -81,7 +81,7 @@ def read_ply_header(path: StrPath) -> PlyHeader:
             # A value takes at least one digit and one separator; the last separator may be missing.
             needed = header.offset + header.count * 2 * len(header.properties) - 1
         if header.packed:
-            needed = max(needed, *(header.others[name].end for name in ("chunk", "sh") if name in header.others))
+            needed = max(needed, *(other.end for other in header.others.values()))
         if needed > file_bytes:
             raise FormatError(f"truncated: {header.count} vertices need {needed} bytes, the file has {file_bytes}")
     return header
