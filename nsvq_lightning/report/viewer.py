@@ -163,14 +163,14 @@ def page_cameras(path: StrPath) -> dict[str, Camera]:
     text = Path(path).read_text(encoding="utf-8")
     found = re.search(r'<script id="scene" type="application/json">(.*)</script>', text)
     cameras = {}
-    opengl = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    opengl = torch.tensor([1.0, -1.0, -1.0, 1.0])
     try:
         scene: dict[str, Any] = json.loads(found[1]) if found else {"cameras": ()}
         near = float(scene.get("near", NEAR))
         for entry in scene["cameras"]:
             name = str(entry["name"])
             pose = torch.tensor(entry["camera_to_world"], dtype=torch.float64).view(4, 4)
-            viewmat = (pose @ opengl).inverse().float()
+            viewmat = (pose * opengl).inverse().float()
             lens = tuple(entry[key] for key in _LENS)
             cameras[name] = camera_of(viewmat, lens, int(entry["width"]), int(entry["height"]), near)
     except (ValueError, KeyError, TypeError, RuntimeError) as error:

@@ -196,24 +196,18 @@ _ITERATIONS = 4
 
 @kernel
 def _cut(rows, order):  # type: ignore[no-untyped-def]
-    starts, ends = np.empty(128, np.int64), np.empty(128, np.int64)
-    starts[0], ends[0] = 0, len(rows)
-    waiting = 1
-    while waiting > 0:
-        waiting -= 1
-        start, end = starts[waiting], ends[waiting]
-        if end - start < 2:
-            continue
-        before = order[start:end].copy()
-        _, direction = mean_and_direction(rows, None, before, _ITERATIONS)
-        projections = np.zeros(end - start)
-        for i in range(end - start):
-            for j in range(rows.shape[1]):
-                projections[i] += rows[before[i], j] * direction[j]
-        places = np.argsort(projections, kind="mergesort")
-        for i in range(end - start):
-            order[start + i] = before[places[i]]
-        middle = start + (end - start + 1) // 2
-        starts[waiting], ends[waiting] = start, middle
-        starts[waiting + 1], ends[waiting + 1] = middle, end
-        waiting += 2
+    count = len(order)
+    if count < 2:
+        return
+    _, direction = mean_and_direction(rows, None, order, _ITERATIONS)
+    projections = np.zeros(count)
+    for i in range(count):
+        for j in range(rows.shape[1]):
+            projections[i] += rows[order[i], j] * direction[j]
+    places = np.argsort(projections, kind="mergesort")
+    before = order.copy()
+    for i in range(count):
+        order[i] = before[places[i]]
+    middle = (count + 1) // 2
+    _cut(rows, order[:middle])
+    _cut(rows, order[middle:])
