@@ -189,7 +189,7 @@ _NUMBERS = (int, float)
 def _entry(table: object, key: str, kind: type[_T]) -> _T:
     """An entry of a type; numbers must be finite and not negative."""
     value: Any = table.get(key) if isinstance(table, dict) else None
-    number = kind in (int, float)
+    number = kind in _NUMBERS
     fits = type(value) in _NUMBERS if kind is float else type(value) is kind
     if not fits or (number and not 0 <= value <= sys.float_info.max):
         expected = f"{kind.__name__}, finite and not negative" if number else kind.__name__
