@@ -12,8 +12,7 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.compression.importance import most_contributing
-from nsvq_lightning.data.edges import edges_of
-from nsvq_lightning.data.images import ImageStore
+from nsvq_lightning.data.images import ImageStore, edges_of
 from nsvq_lightning.data.scene import View, detailed_pixels
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.random import draw_rows, generator

@@ -34,9 +34,9 @@ def unknown_option(message: str, options: Iterable[str]) -> str:
 
 
 def names(text: str) -> tuple[str, ...]:
-    """The entries of ``A,B``, each once."""
+    """The entries of ``A,B``, each once; an empty one if there is none."""
     entries = (part.strip() for part in text.split(","))
-    return tuple(dict.fromkeys(filter(None, entries)))
+    return tuple(dict.fromkeys(filter(None, entries))) or ("",)
 
 
 def some_of(known: Iterable[str]) -> Callable[[str], tuple[str, ...]]:
@@ -48,7 +48,7 @@ def some_of(known: Iterable[str]) -> Callable[[str], tuple[str, ...]]:
 
     def parse(text: str) -> tuple[str, ...]:
         chosen = tuple(known) if text == "all" else names(text)
-        if not chosen or not set(chosen) <= set(known):
+        if not set(chosen) <= set(known):
             raise argparse.ArgumentTypeError(f"choose some of {', '.join(known)}, or all, got {text!r}")
         return chosen
 

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import positive, views_of
-from nsvq_lightning.compression.setting import Setting, setting_for
 from nsvq_lightning.io.atomic import write_bytes
 from nsvq_lightning.io.formats import FORMATS
 from nsvq_lightning.io.lod import NAME
@@ -114,13 +113,12 @@ def run(options: argparse.Namespace) -> int:
         raise argparse.ArgumentError(None, wrong)
     scene = read_scene(options.input)
     most = splats_left(options.splats, len(scene))
-    # What is impossible is said before the scene is looked at.
-    if options.target_bytes is not None:
-        setting_for(options.target_bytes, most, scene.sh_degree)
-    from nsvq_lightning.commands.compressor import Compressor
+    from nsvq_lightning.commands.compressor import Compressor, setting_for
     from nsvq_lightning.compression.viewpoints import Measure, own_scene
     from nsvq_lightning.data.datamodule import SceneDataModule
 
+    if options.target_bytes is not None:  # what is impossible is said before the scene is looked at
+        setting_for(options.target_bytes, most, scene.sh_degree)
     splats = scene.decode()
     cameras, photos = views_of(options.input, splats, VIEWS, options.root)
     measure = Measure(splats, cameras, scene.antialiased)
@@ -135,6 +133,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _write_levels(options: argparse.Namespace, compressor: "Compressor", most: int) -> None:
     """Write a streamed SOG of levels of detail, the finest of ``most`` splats."""
+    from nsvq_lightning.commands.compressor import Setting
     from nsvq_lightning.io.formats import save
 
     scene = compressor.scene
@@ -148,6 +147,8 @@ def _write_levels(options: argparse.Namespace, compressor: "Compressor", most: i
 
 def _write_file(options: argparse.Namespace, compressor: "Compressor", most: int, views: str) -> None:
     """Write the ``.nsvq`` file of at most ``most`` splats that is asked for."""
+    from nsvq_lightning.commands.compressor import Setting
+
     if options.max_error is not None:
         candidate = compressor.smallest_within(options.max_error, most)
     elif options.target_bytes is not None:

@@ -15,7 +15,7 @@ import platform
 import re
 import shutil
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -217,25 +217,21 @@ def check_model(root: Path) -> Iterator[Finding]:
 
 def check_cameras(model: "ColmapModel") -> Iterator[Finding]:
     """Number, models and sizes of the cameras, and what distortion does to the corners."""
+    from nsvq_lightning.data.images import size_range
+
     photos = len(model.images)
     cameras = [model.cameras[number] for number in {image.camera_id for image in model.images}]
     sizes = {(camera.width, camera.height) for camera in cameras}
     names = sorted({camera.model_name for camera in cameras})
-    text = f"{len(cameras)} of {'/'.join(names)}, {_range(sizes)}, for {photos} registered photos"
+    text = f"{len(cameras)} of {'/'.join(names)}, {size_range(sizes)}, for {photos} registered photos"
     advice = "more exact if one lens took them and COLMAP knows it (--ImageReader.single_camera 1)"
     many = len(cameras) > max(1, photos // 2) and len(sizes) <= 2
     yield judged("cameras", text, advice, when=model.source == "COLMAP" and many)
 
 
-def _range(sizes: Collection[tuple[int, int]]) -> str:
-    """The smallest and the largest of some sizes."""
-    ends = sorted({min(sizes), max(sizes)})
-    return " to ".join(f"{width}x{height}" for width, height in ends)
-
-
 def check_points(model: "ColmapModel") -> Iterator[Finding]:
     """Number of points, and outliers."""
-    from nsvq_lightning.rendering.frame import middle_of
+    from nsvq_lightning.data.scene import astray
 
     count = len(model.points)
     if not count:
@@ -248,9 +244,7 @@ def check_points(model: "ColmapModel") -> Iterator[Finding]:
         program = "COLMAP" if model.source == "COLMAP" else "the export"
         yield Finding("problem", "points", f"none is finite: run {program} again")
         return
-    middle, usual = middle_of(finite)
-    # Ten times farther from the middle than four fifths of the points.
-    far = float(np.mean(np.linalg.norm(finite - middle, axis=1) > 10.0 * max(usual, 1e-12)))
+    far = float(astray(finite, 10).mean())
     text = f"{count:,}, {100 * far:.2g} % far outliers"
     if len(finite) < count:
         text += f", {count - len(finite)} not finite (left out)"
@@ -266,6 +260,8 @@ def check_overlap(model: "ColmapModel") -> Iterator[Finding]:
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
+    from nsvq_lightning.data.reconstruct import some
+
     pairs = model.observations
     if pairs is None or not len(pairs):
         text = f"{model.source} has no observations: how far views overlap is unknown"
@@ -280,9 +276,7 @@ def check_overlap(model: "ColmapModel") -> Iterator[Finding]:
     groups, group_of = connected_components(common >= 15, directed=False)
     apart = group_of != np.bincount(group_of).argmax()
     weak = np.flatnonzero(apart if groups > 1 else best < 0.3)
-    named = ", ".join(names[i] for i in weak[:3])
-    if len(weak) > 3:
-        named += f" and {len(weak) - 3} more"
+    named = some([names[i] for i in weak], 3)
     usual, least = 100 * float(np.median(best)), 100 * float(best.min())
     text = f"a photo shares {usual:.0f} % of its points with its best partner, at least {least:.0f} %"
     advice = f"little for {named}; take photos in between"
@@ -309,7 +303,7 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
 
 def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     """Whether files are of the size that the model says, and what becomes of those that lie on their side."""
-    from nsvq_lightning.data.images import same_shape
+    from nsvq_lightning.data.images import same_shape, size_range
     from nsvq_lightning.data.scene import OTHER_SHAPE
 
     sources = scene.images.sources
@@ -319,7 +313,7 @@ def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
         size = camera.width, camera.height
         others += not same_shape(source.size, size)
         scaled += source.size != size
-    used = _range({(source.pinhole.width, source.pinhole.height) for source in sources})
+    used = size_range({(source.pinhole.width, source.pinhole.height) for source in sources})
     text = f"trained at {used}; {others or scaled} of {len(sources)} files "
     if others:
         yield Finding("problem", "sizes", f"{text}{OTHER_SHAPE}")

@@ -3,6 +3,7 @@
 import argparse
 import json
 from collections.abc import Iterable
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ def _text(facts: dict[str, Any]) -> str:
         rows.append(("origin", ", ".join(map(repr, facts["origin"]))))
     parts = ["\n".join(f"{name:<11} {value}" for name, value in rows)]
     if "attributes" in facts:
-        entries = [(a["name"], a["storage"], a["dim"], a["codes"], a["bits"]) for a in facts["attributes"]]
+        entries = map(itemgetter("name", "storage", "dim", "codes", "bits"), facts["attributes"])
         parts.append(_table(("attribute", "storage", "D", "K", "bits"), entries))
     if "streams" in facts:
         streams = []

@@ -49,7 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(further=())
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="where all results go")
     add = parser.add_argument_group("what is combined; lists have commas between their entries").add_argument
-    listed: dict[str, Any] = {"type": _entries, "default": ("",)}
+    # An empty entry leaves the choice to the configuration.
+    listed: dict[str, Any] = {"type": names, "default": ("",)}
     add("--scenes", **listed, metavar="A,B", help="COLMAP folders (default: that of the configuration)")
     add("--configs", **listed, metavar="A,B", help="files or shipped names, as for nsvq fit --config")
     add("--quantizers", **listed, metavar="A,B", help="classes, as for nsvq fit --model.quantizer")
@@ -60,11 +61,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--keep-checkpoints", action="store_true", help="keep those of finished runs")
     help_ = "only print a command for each unfinished run, to be run anywhere"
     parser.add_argument("--commands", action="store_true", help=help_)
-
-
-def _entries(text: str) -> tuple[str, ...]:
-    """Those of a list; an empty one, which leaves the choice to the configuration, if there is none."""
-    return names(text) or ("",)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -141,9 +137,7 @@ def plan(options: argparse.Namespace) -> list[Run]:
     for scene in filter(None, options.scenes):
         if not Path(scene).is_dir():
             raise ValueError(f"{scene} is no folder; --scenes takes COLMAP folders with commas between them")
-    common = [*options.further, "--trainer.logger=false"]
-    if options.max_steps is not None:
-        common.append(f"--trainer.max_steps={options.max_steps}")
+    common = [*options.further, "--trainer.logger=false", *_given({"trainer.max_steps": options.max_steps})]
     runs: list[Run] = []
     for config in options.configs:
         arguments = [*_given({"config": config}), *common]
@@ -181,7 +175,7 @@ def plan(options: argparse.Namespace) -> list[Run]:
 
 def _given(chosen: Mapping[str, object]) -> list[str]:
     """Options of ``nsvq fit`` for what has been chosen, and is not empty."""
-    return [f"--{option}={value}" for option, value in chosen.items() if value != ""]
+    return [f"--{option}={value}" for option, value in chosen.items() if value not in ("", None)]
 
 
 def resolve(arguments: Sequence[str]) -> str:
@@ -315,7 +309,7 @@ def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> 
     return rows
 
 
-def row_of(run: Run, error: str = "") -> Row:
+def row_of(run: Run, error: str) -> Row:
     """What a run came to that has finished, or failed with an error.
 
     Returns:

@@ -13,7 +13,7 @@ from lightning.pytorch.utilities import rank_zero_info
 from torch.utils.data import DataLoader, Dataset, IterableDataset
 
 from nsvq_lightning.data.colmap import SceneError
-from nsvq_lightning.data.images import Picture
+from nsvq_lightning.data.images import Picture, size_range
 from nsvq_lightning.data.scene import Factor, Scene, View, load_scene, usable
 from nsvq_lightning.random import generator
 
@@ -258,8 +258,7 @@ class _OrderedViews(Dataset[View]):
 
 def _summary(scene: Scene) -> str:
     """Size and split of a scene, and what of its photos does not count."""
-    sizes = sorted({(camera.width, camera.height) for camera in scene.cameras})
-    size = f"{sizes[0][0]}x{sizes[0][1]}" + (f" to {sizes[-1][0]}x{sizes[-1][1]}" if len(sizes) > 1 else "")
+    size = size_range([(camera.width, camera.height) for camera in scene.cameras])
     names = [scene.names[i] for i in scene.test]
     shown = ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:3])}, …, {names[-1]}"
     text = (

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.compute.memory import trim
-from nsvq_lightning.data.edges import edges_of
-from nsvq_lightning.data.images import resized
+from nsvq_lightning.data.images import edges_of, resized
 from nsvq_lightning.data.scene import Scene, in_parallel
 from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Uint8s

@@ -1,7 +1,7 @@
 """From the file of a photo to the picture that a view is compared with, which is kept while a byte budget lasts."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +17,8 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 from torch import Tensor
 
+from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.data.colmap import Pinhole, SceneError
-from nsvq_lightning.data.edges import Edges, edges_of
 from nsvq_lightning.data.undistortion import Undistortion
 from nsvq_lightning.splats.conventions import Bools, Uint8s
 
@@ -147,6 +147,12 @@ def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether two sizes (width, height) have one aspect ratio, up to rounding of a side to a pixel of the first."""
     difference = abs(one[0] * other[1] - one[1] * other[0])
     return difference < max(ROUNDED * one[1] * other[0], *other)
+
+
+def size_range(sizes: Collection[tuple[int, int]]) -> str:
+    """The smallest and the largest of sizes (width, height), in words."""
+    ends = sorted({min(sizes), max(sizes)})
+    return " to ".join(f"{width}x{height}" for width, height in ends)
 
 
 def read_mask(path: Path, width: int, height: int) -> Bools:
@@ -283,6 +289,51 @@ class ImageSource:
         for channel in range(3):  # one by one: as numbers of 32 bits, they take several times the memory
             image[..., channel] = np.rint(image[..., channel] * share + 255 * (1 - share))
         return image, None
+
+
+class Edges(NamedTuple):
+    """Edges of a photo, a byte a pixel.
+
+    Attributes:
+        values: Strength ``[H, W]`` uint8, 0 where it is least.
+        strongest: The largest of them, at least 1.
+    """
+
+    values: Tensor
+    strongest: int
+
+    def strength(self, device: torch.device | str = "cpu") -> Tensor:
+        """Strength ``[H, W]`` float32 in [0, 1]: 1 for the strongest edge."""
+        return to_device(self.values, device).float() / self.strongest
+
+
+def edges_of(image: Tensor, mask: Tensor | None = None) -> Edges:
+    """Edges of a photo; one without any is 0 everywhere.
+
+    Args:
+        image: ``[H, W, 3]`` uint8 RGB.
+        mask: Which pixels count ``[H, W]`` bool; those beside one that does not have strength 0. None if all count.
+    """
+    values = torch.from_numpy(high_pass(image, mask, cv2.CV_8U))  # which also clips to 0..255
+    values = values - values.min()
+    return Edges(values, max(int(values.max()), 1))
+
+
+def high_pass(image: Tensor, mask: Tensor | None, depth: int) -> NDArray[Any]:
+    """Eight times the grey value of each pixel less those of its neighbours, 0 beside pixels that do not count.
+
+    Args:
+        image: ``[H, W, 3]`` uint8 RGB.
+        mask: Which pixels count ``[H, W]`` bool; None if all do.
+        depth: OpenCV's name of the type of the result.
+    """
+    grey = cv2.cvtColor(image.cpu().numpy(), cv2.COLOR_RGB2GRAY)
+    kernel = np.full((3, 3), -1, np.float32)
+    kernel[1, 1] = 8
+    passed: NDArray[Any] = cv2.filter2D(grey, depth, kernel)
+    if mask is not None:
+        passed *= cv2.erode(mask.cpu().numpy().view(np.uint8), np.ones((3, 3), np.uint8))
+    return passed
 
 
 class ImageStore:

@@ -451,10 +451,10 @@ def _converted(image: PIL.Image.Image, path: Path, kind: str) -> bytes:
     return file.getvalue()
 
 
-def some(names: Sequence[str]) -> str:
+def some(names: Sequence[str], most: int = MAX_NAMED) -> str:
     """The first of many names, and how many more there are."""
-    shown = ", ".join(names[:MAX_NAMED])
-    return f"{shown} and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else shown
+    shown = ", ".join(names[:most])
+    return f"{shown} and {len(names) - most} more" if len(names) > most else shown
 
 
 def sharpness(picture: MatLike) -> float:

@@ -18,13 +18,13 @@ from tqdm import tqdm
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, larger_models
-from nsvq_lightning.data.edges import high_pass
 from nsvq_lightning.data.images import (
     ON_ITS_SIDE,
     ImageHead,
     ImageSource,
     ImageStore,
     Picture,
+    high_pass,
     image_head,
     same_shape,
 )
@@ -222,7 +222,7 @@ def load_scene(
         poses = replace(poses, points=points, colors=np.full((len(points), 3), 128, np.uint8))
     centres = np.stack([image.centre for image in poses.images])
     extent = EXTENT * frame.unit if np.ptp(centres, axis=0).any() else 0.0
-    usable = _away_from(centres, poses.points, _AT_CAMERA * extent) & ~_astray(poses.points, _POINT_ASTRAY)
+    usable = _away_from(centres, poses.points, _AT_CAMERA * extent) & ~astray(poses.points, _POINT_ASTRAY)
     if not usable.all():
         text = "left out %d of %d points: they are at the centre of a camera, or far from all others"
         log.warning(text, len(usable) - usable.sum(), len(usable))
@@ -343,7 +343,7 @@ def _framed(model: ColmapModel, root: Path) -> tuple[ColmapModel, Frame]:
     """The frame of a model's cameras, and the model with an origin near them; warns of cameras that went astray."""
     centres = np.stack([image.centre for image in model.images])
     frame = Frame.around(centres)
-    lost = np.flatnonzero(_astray(centres, _CAMERA_ASTRAY))
+    lost = np.flatnonzero(astray(centres, _CAMERA_ASTRAY))
     if len(lost):
         first = model.images[lost[0]].name
         log.warning("%d photos are far from all others, first %s: check its pose, or leave it out", len(lost), first)
@@ -357,7 +357,7 @@ def _framed(model: ColmapModel, root: Path) -> tuple[ColmapModel, Frame]:
     return replace(model, images=images, points=model.points - frame.middle), Frame(frame.unit, origin=frame.middle)
 
 
-def _astray(places: Float64s, times: float) -> Bools:
+def astray(places: Float64s, times: float) -> Bools:
     """Which places ``[P, 3]`` are much farther from the middle than the others; none of those that are not finite.
 
     Args:

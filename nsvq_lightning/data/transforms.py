@@ -157,8 +157,9 @@ class _Frame:
                 "OPENCV_FISHEYE (k1 to k4) can",
                 PANORAMA if model == "EQUIRECTANGULAR" else "export the photos undistorted, as PINHOLE",
             )
-        if k1 or k2 or k3 or p1 or p2:
-            return "FULL_OPENCV", width, height, (*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+        distortion = (k1, k2, p1, p2, k3)
+        if any(distortion):
+            return "FULL_OPENCV", width, height, (*pinhole, *distortion, 0.0, 0.0, 0.0)
         return "PINHOLE", width, height, pinhole
 
     def _size(self) -> tuple[int, int]:

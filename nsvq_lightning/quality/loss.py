@@ -75,6 +75,11 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2, m
         function = _CpuLoss if kernels == "cpu" else _CudaLoss
         loss: Tensor = function.apply(image, target, dssim_weight)  # type: ignore[no-untyped-call]
         return loss
+    return plain_loss(image, target, dssim_weight)
+
+
+def plain_loss(image: Tensor, target: Tensor, dssim_weight: float) -> Tensor:
+    """The loss of images ``[H, W, 3]`` in plain torch, in the type of the first one."""
     image, target = in_range(image, target)
     return (1 - dssim_weight) * (image - target).abs().mean() + dssim_weight * (1 - plain_ssim(image, target))
 

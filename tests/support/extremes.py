@@ -129,7 +129,7 @@ def _attribute(x: Tensor, codes: int) -> Attribute:
     quantizer = NSVQ(codes, x.shape[1])
     quantizer.fit(x, generator=generator(0, 0, "fit"))
     upstream = 1e-6 * torch.randn(x.shape, generator=generator(0, 0, "upstream"))
-    return Attribute(quantizer.train(), x.clone().requires_grad_(), torch.arange(len(x)), upstream, 5e-3)
+    return Attribute(quantizer.train(), x.clone().requires_grad_(), torch.arange(len(x)), upstream)
 
 
 def quantizer_errors(attribute: Attribute) -> dict[str, float]:

@@ -33,14 +33,12 @@ class Attribute(NamedTuple):
         x: Rows of all splats ``[N, D]``, which move from step to step.
         rows: The visible ones ``[V]``.
         upstream: Gradient of the quantized rows ``[V, D]``.
-        rate: Learning rate: how far Adam moves a number in a step.
     """
 
     quantizer: CodebookQuantizer
     x: Tensor
     rows: Tensor
     upstream: Tensor
-    rate: float
 
 
 def run(scope: Scope) -> Iterator[Measurement]:
@@ -80,8 +78,7 @@ def prepare(splats: RawSplats, codebooks: str) -> dict[str, Attribute]:
         x = attribute_rows(scene.raw(), name).clone()
         quantizer.fit(x, generator=generator(0, 0, "fit", name))
         upstream = 1e-6 * torch.randn(len(chosen), x.shape[1], generator=generator(0, 0, "upstream", name))
-        rate = getattr(LearningRates(), name)
-        prepared[name] = Attribute(quantizer.train(), x.requires_grad_(), chosen, upstream, rate)
+        prepared[name] = Attribute(quantizer.train(), x.requires_grad_(), chosen, upstream)
     return prepared
 
 
@@ -89,9 +86,10 @@ def prepare(splats: RawSplats, codebooks: str) -> dict[str, Attribute]:
 def _advance(attributes: Mapping[str, Attribute], iteration: int) -> None:
     """Move rows and codes about as far as a step of Adam does, or a search that remembers would have nothing to do."""
     for name, attribute in attributes.items():
+        rate = getattr(LearningRates(), name)  # how far Adam moves a number
         for what, values in (("rows", attribute.x), ("codes", attribute.quantizer.codebook)):
             draw = generator(0, iteration, what, name)
-            values += attribute.rate * (2 * torch.rand(values.shape, generator=draw) - 1)
+            values += rate * (2 * torch.rand(values.shape, generator=draw) - 1)
 
 
 # Quantized rows ``[V, D]`` and their codes ``[V]``, given quantizer, rows of all splats, noise and visible rows.
@@ -101,7 +99,7 @@ Quantize = Callable[[CodebookQuantizer, Tensor, torch.Generator, Tensor], tuple[
 def step(attributes: Mapping[str, Attribute], turn: int, quantize: Quantize = CodebookQuantizer.__call__) -> Results:
     """One forward and backward pass, by default of the quantizers of the package."""
     results: Results = {}
-    for name, (quantizer, x, rows, upstream, _) in attributes.items():
+    for name, (quantizer, x, rows, upstream) in attributes.items():
         quantized, codes = quantize(quantizer, x, generator(0, turn, "noise", name), rows)
         gradient, _ = torch.autograd.grad(quantized, (x, quantizer.codebook), upstream)
         results[name] = quantized.detach(), gradient, codes

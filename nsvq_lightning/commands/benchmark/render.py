@@ -15,8 +15,7 @@ from torch import Tensor
 from nsvq_lightning.commands.benchmark.timing import Measurement, Scope, compare
 from nsvq_lightning.commands.benchmark.workloads import Workload, relative_l2, workloads
 from nsvq_lightning.compute.devices import devices_with_kernels, fast_backends
-from nsvq_lightning.quality.loss import photometric_loss
-from nsvq_lightning.quality.ssim import in_range, plain_ssim
+from nsvq_lightning.quality.loss import photometric_loss, plain_loss
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats
@@ -161,10 +160,3 @@ def _loss_rows(scope: Scope, device: str) -> Iterator[Measurement]:
     }
     errors = {method: {"gradient error": relative_l2(call(), truth)} for method, call in cases.items()}
     yield from compare(LOSS, f"{PHOTO[1]}x{PHOTO[0]}", cases, errors, scope, device)
-
-
-def plain_loss(image: Tensor, photo: Tensor, dssim_weight: float) -> Tensor:
-    """(1 - λ)·L1 + λ·(1 - SSIM) of images ``[H, W, 3]`` in plain torch, in the type of the first one."""
-    image, photo = in_range(image, photo)
-    l1 = (image - photo).abs().mean()
-    return (1 - dssim_weight) * l1 + dssim_weight * (1 - plain_ssim(image, photo))
