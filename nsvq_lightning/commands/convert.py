@@ -44,9 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--spz-axes", choices=spz.SPZ_AXES, help=help_)
     add("--level", choices=LEVELS, help="level of .nsvq")
     add("--measure", action="store_true", help="render both files and say how they differ")
-    corners = ("X0", "Y0", "Z0", "X1", "Y1", "Z1")
     help_ = "keep the splats with centres in this box, in scene units of the input"
-    add("--crop", nargs=6, type=float, metavar=corners, help=help_)
+    add("--crop", nargs=6, type=float, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"), help=help_)
     help_ = "remove splats that no photo of --data.root supports; takes minutes"
     add("--floaters", action="store_true", help=help_)
     help_ = "keep so many splats, or this share of them: those that contribute most to its pictures"

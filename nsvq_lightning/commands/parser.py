@@ -140,7 +140,7 @@ def command_help(parser: LightningArgumentParser, command: str) -> str:
         parser: Its parser, with options named ``group.name``.
         command: Its name.
     """
-    groups: dict[str, list[Option]] = {"run": [], "callbacks": [], "model": [], "skips": [], "trainer": []}
+    groups: dict[str, list[Option]] = {name: [] for name in ("run", "callbacks", "model", "skips", "trainer")}
     for option in _options(parser):
         group = option.name.partition(".")[0] if "." in option.name else "run"
         if group in groups and option.name not in (*groups, "model.splats"):

@@ -106,7 +106,7 @@ def own_scene(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool
         root=Path("own pictures"),
         names=tuple(f"{number:03d}" for number in range(len(cameras))),
         cameras=tuple(cameras),
-        images=ImageStore.holding([Picture(photo, None) for photo in photos]),
+        images=ImageStore((), held=[Picture(photo, None) for photo in photos]),
         points=splats.means.detach(),
         colors=torch.zeros_like(splats.means),
         train=tuple(range(len(cameras))),

@@ -8,7 +8,7 @@ and masks leave out what is in front of it or behind: no splat is spent on that,
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -184,25 +184,6 @@ _POINT = [(axis, "<f4") for axis in "xyz"] + [(color, "u1") for color in ("red",
 MIN_SHOWN = 0.05
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """A part that is being written.
-
-    Attributes:
-        block: The part.
-        folder: Where to.
-        inside: Which points of the scene are in it or in its surroundings ``[P]``.
-        train: Its train photos, as frames of ``transforms.json``.
-        test: Its test photos.
-    """
-
-    block: Block
-    folder: Path
-    inside: Bools
-    train: list[dict[str, Any]] = field(default_factory=list)
-    test: list[dict[str, Any]] = field(default_factory=list)
-
-
 def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path]) -> list[tuple[int, int]]:
     """Write each part as a scene folder: cropped photos, masks, points, and a ``transforms.json`` with the cameras.
 
@@ -216,37 +197,40 @@ def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path])
         OSError: A file cannot be written.
     """
     points = scene.points.double().numpy()
-    parts = [_Part(block, folder, block.contains(points, 1.0)) for block, folder in zip(blocks, folders, strict=True)]
+    insides = [block.contains(points, 1.0) for block in blocks]
+    # Of each part, the train and the test photos, as frames of ``transforms.json``.
+    frames: list[tuple[list[dict[str, Any]], list[dict[str, Any]]]] = [([], []) for _ in blocks]
     for index, camera in enumerate(scene.cameras):
         front = points_in_front(points, camera)
-        masks = [shown(front, part.inside, camera) for part in parts]
-        showing = [(part, mask) for part, mask in zip(parts, masks, strict=True) if mask.mean() >= MIN_SHOWN]
+        masks = [shown(front, inside, camera) for inside in insides]
+        showing = [part for part, mask in enumerate(masks) if mask.mean() >= MIN_SHOWN]
         if not showing:
             continue
         image, counting = scene.images[index]
-        for part, mask in showing:
+        for part in showing:
+            mask = masks[part]
             if counting is not None:
                 mask &= counting.numpy()
             if mask.any():
-                frame = _write_photo(part.folder, index, image.numpy(), mask, camera)
-                (part.test if index in scene.test else part.train).append(frame)
+                train, test = frames[part]
+                frame = _write_photo(folders[part], index, image.numpy(), mask, camera)
+                (test if index in scene.test else train).append(frame)
     colors = np.rint(255 * scene.colors.numpy())
-    for part in parts:
-        train, test = len(part.train), len(part.test)
+    for block, folder, inside, (train, test) in zip(blocks, folders, insides, frames, strict=True):
         if not train or not test:
-            raise SceneError(f"a part is in {train} train and {test} test photos: ask for fewer parts")
-        columns = [*points[part.inside].T, *colors[part.inside].T]
-        write_elements(part.folder / "points.ply", {"vertex": np.rec.fromarrays(columns, dtype=_POINT)})
+            raise SceneError(f"a part is in {len(train)} train and {len(test)} test photos: ask for fewer parts")
+        columns = [*points[inside].T, *colors[inside].T]
+        write_elements(folder / "points.ply", {"vertex": np.rec.fromarrays(columns, dtype=_POINT)})
         model = {
             "camera_model": "PINHOLE",
             "ply_file_path": "points.ply",
-            "frames": part.train + part.test,
-            "train_filenames": [frame["file_path"] for frame in part.train],
-            "test_filenames": [frame["file_path"] for frame in part.test],
+            "frames": train + test,
+            "train_filenames": [frame["file_path"] for frame in train],
+            "test_filenames": [frame["file_path"] for frame in test],
         }
-        write_text(part.folder / "transforms.json", json.dumps(model, indent=1))
-        write_text(part.folder / BLOCK, json.dumps(asdict(part.block), indent=1))
-    return [(len(part.train), len(part.test)) for part in parts]
+        write_text(folder / "transforms.json", json.dumps(model, indent=1))
+        write_text(folder / BLOCK, json.dumps(asdict(block), indent=1))
+    return [(len(train), len(test)) for train, test in frames]
 
 
 def shown(front: _Front, inside: Bools, camera: Camera) -> Bools:

@@ -1,6 +1,7 @@
 """Lightning data modules: any scene, a scene folder, and the embedded demo scene."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import count, pairwise
 from pathlib import Path
@@ -224,36 +225,36 @@ class DemoDataModule(ColmapDataModule):
         super().__init__(root, **options)
 
 
+@dataclass(eq=False)
 class _TrainViews(IterableDataset[View]):
     """Train views in the sampler's order; a new iterator starts at the trainer's step."""
 
-    def __init__(self, data: SceneDataModule) -> None:
-        self._data = data
+    data: SceneDataModule
 
     def __iter__(self) -> Iterator[View]:
-        scene = self._data.scene
-        order = view_order(len(scene.train), self._data.seed, *self._data.process, self._data.draw)
+        scene = self.data.scene
+        order = view_order(len(scene.train), self.data.seed, *self.data.process, self.data.draw)
         for current, following in pairwise(order):
             scene.images.prefetch(scene.train[following])
             yield scene.view(scene.train[current])
 
 
+@dataclass(eq=False)
 class _OrderedViews(Dataset[View]):
     """Given views of a scene; each access starts decoding the one ``stride`` further on."""
 
-    def __init__(self, scene: Scene, indices: Sequence[int], stride: int) -> None:
-        self._scene = scene
-        self._indices = indices
-        self._stride = stride
+    scene: Scene
+    indices: Sequence[int]
+    stride: int
 
     def __len__(self) -> int:
-        return len(self._indices)
+        return len(self.indices)
 
     def __getitem__(self, position: int) -> View:
-        following = position + self._stride
+        following = position + self.stride
         if following < len(self):
-            self._scene.images.prefetch(self._indices[following])
-        return self._scene.view(self._indices[position])
+            self.scene.images.prefetch(self.indices[following])
+        return self.scene.view(self.indices[position])
 
 
 def _summary(scene: Scene) -> str:

@@ -346,30 +346,25 @@ class ImageStore:
     Args:
         sources: One entry per view.
         cache_bytes: Budget for the kept pictures in bytes; 0 keeps none.
+        held: Pictures that are there already and need no source.
 
     Raises:
         ValueError: ``cache_bytes`` is negative.
     """
 
-    def __init__(self, sources: Sequence[ImageSource], cache_bytes: int = 4 << 30) -> None:
+    def __init__(
+        self, sources: Sequence[ImageSource], cache_bytes: int = 4 << 30, held: Sequence[Picture] = ()
+    ) -> None:
         if cache_bytes < 0:
             raise ValueError(f"cache_bytes must be at least 0, got {cache_bytes}")
         self.sources = tuple(sources)
-        self.nbytes = sum(source.nbytes for source in self.sources)
+        self.nbytes = sum(source.nbytes for source in self.sources) + sum(picture.nbytes for picture in held)
         """Bytes of all pictures, decoded."""
         self._free = cache_bytes
         self._free_for_edges = cache_bytes - self.nbytes  # a picture takes longer to decode again
-        self._kept: dict[int, Picture] = {}
+        self._kept = dict(enumerate(held))
         self._edges: dict[int, Edges] = {}
         self._coming: dict[int, Future[Picture]] = {}
-
-    @classmethod
-    def holding(cls, pictures: Sequence[Picture]) -> "ImageStore":
-        """Pictures that are there already and need no file."""
-        store = cls(())
-        store._kept = dict(enumerate(pictures))
-        store.nbytes = sum(picture.nbytes for picture in pictures)
-        return store
 
     def __getitem__(self, index: int) -> Picture:
         """Picture ``index`` on the CPU; treat it as read-only.

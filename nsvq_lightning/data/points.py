@@ -36,7 +36,7 @@ def read_points(path: Path) -> tuple[Float64s, Uint8s]:
     table = np.concatenate([np.zeros((0, len(names))), *parts])
     xyz, values = table[:, :3], table[:, 3:]
     if not rgb:
-        return xyz, np.full((len(xyz), 3), 128, np.uint8)
+        return xyz, np.full_like(xyz, 128, np.uint8)
     if rgb == _COLORS[2]:
         values = (0.5 + SH_C0 * values).clip(0, 1)
     return xyz, rgb_bytes(values, floats=header.dtype[names[3]].kind == "f")

@@ -219,7 +219,7 @@ def load_scene(
     if not len(poses.points):
         points = random_points([cameras[index] for index in train])
         log.info("%s has no points: %d random ones in what the cameras see take their place", root, len(points))
-        poses = replace(poses, points=points, colors=np.full((len(points), 3), 128, np.uint8))
+        poses = replace(poses, points=points, colors=np.full_like(points, 128, np.uint8))
     centres = np.stack([image.centre for image in poses.images])
     extent = EXTENT * frame.unit if np.ptp(centres, axis=0).any() else 0.0
     usable = _away_from(centres, poses.points, _AT_CAMERA * extent) & ~astray(poses.points, _POINT_ASTRAY)
@@ -248,10 +248,6 @@ OTHER_SHAPE = (
 )
 
 
-# With more distorted cameras than this (say, one per photo), the undistortion maps would take more than the images.
-_CAMERAS_WITH_KEPT_MAPS = 8
-
-
 def _image_sources(
     model: ColmapModel, paths: list[Path], masks: list[Path | None], divisor: int, max_width: int | None
 ) -> list[ImageSource]:
@@ -269,11 +265,10 @@ def _image_sources(
         log.info("%d of %d photos are turned by their EXIF orientation, as their cameras are", turned, len(heads))
     if others:
         log.warning("%d of %d photos %s", others, len(heads), OTHER_SHAPE)
-    keep_maps = len(set(kinds)) <= _CAMERAS_WITH_KEPT_MAPS
     lenses = {}
     for kind in dict.fromkeys(kinds):
         number, size = kind
-        full, undistortion = rectify(model.cameras[number], *size, keep_maps=keep_maps)
+        full, undistortion = rectify(model.cameras[number], *size)
         scale = 1 / divisor if max_width is None or full.width <= max_width else max_width / full.width
         lenses[kind] = undistortion, full.scaled(scale, scale)
     return [

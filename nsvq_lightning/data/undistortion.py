@@ -1,6 +1,7 @@
 """Photos of a camera with distortion, as a pinhole camera would have taken them."""
 
 import logging
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -17,14 +18,13 @@ log = logging.getLogger(__name__)
 Maps = tuple[Float32s, Float32s, Bools]
 
 
-def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> "tuple[Pinhole, Undistortion | None]":
+def rectify(camera: Any, width: int, height: int) -> "tuple[Pinhole, Undistortion | None]":
     """Pinhole camera of the undistorted images, and how to undistort them (None if there is nothing to do).
 
     Args:
         camera: ``pycolmap.Camera`` of any model, or a pinhole.
         width: Width of the image files in pixels; may differ from the model's.
         height: Height of the image files in pixels.
-        keep_maps: See :class:`Undistortion`.
 
     Raises:
         SceneError: The camera cannot be turned into a pinhole camera.
@@ -35,7 +35,7 @@ def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> "tu
     if (polynomial and camera.is_undistorted()) or camera.model_name in ("SIMPLE_PINHOLE", "PINHOLE"):
         pinhole = Pinhole(camera.calibration_matrix(), camera.width, camera.height)
         return pinhole.scaled(width / camera.width, height / camera.height), None
-    undistortion = Undistortion(camera, width, height, keep_maps)
+    undistortion = Undistortion(camera, width, height)
     return undistortion.pinhole, undistortion
 
 
@@ -49,13 +49,12 @@ class Undistortion:
         camera: Distorted ``pycolmap.Camera``.
         width: Width of the image files in pixels.
         height: Height of the image files in pixels.
-        keep_maps: Keep the map, 9 bytes per pixel, for the next image of this camera.
 
     Raises:
         SceneError: The camera has no pinhole counterpart, for example a spherical one.
     """
 
-    def __init__(self, camera: Any, width: int, height: int, keep_maps: bool) -> None:
+    def __init__(self, camera: Any, width: int, height: int) -> None:
         pycolmap = import_pycolmap()
         try:
             ideal = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
@@ -69,8 +68,6 @@ class Undistortion:
         self._size = (width, height)
         self._scale = (width / camera.width, height / camera.height)
         self.pinhole = Pinhole(ideal.calibration_matrix(), ideal.width, ideal.height).scaled(*self._scale)
-        self._keep_maps = keep_maps
-        self._maps: Maps | None = None
         self._warned = False
 
     def __call__(self, image: Uint8s, kept: Bools | None = None) -> tuple[Uint8s, Bools | None]:
@@ -83,7 +80,7 @@ class Undistortion:
         Returns:
             The pinhole image, and its pixels that the camera saw and whose sources count ``[H, W]``; None if all count.
         """
-        columns, rows, blank = self.maps()
+        columns, rows, blank = kept_maps(self)
         # replicate the border, so that the cubic kernel does not mix black into the edge of the crop
         result: Uint8s = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         result[blank] = 0
@@ -95,8 +92,6 @@ class Undistortion:
 
     def maps(self) -> Maps:
         """Where each pixel of the pinhole image comes from."""
-        if self._maps is not None:
-            return self._maps
         pixels = self._source_pixels()
         # more than a pixel outside, or NaN where the ray leaves the domain of the camera model
         blank: Bools = np.any((pixels <= -1) | (pixels >= self._size) | np.isnan(pixels), axis=-1)
@@ -107,10 +102,7 @@ class Undistortion:
                 f"camera {self._camera.camera_id} ({self._camera.model_name}): {100 * blank.mean():.1f} % of the "
                 "pinhole image is left out: its field of view is too wide for a pinhole"
             )
-        maps = columns, rows, blank
-        if self._keep_maps:
-            self._maps = maps
-        return maps
+        return columns, rows, blank
 
     def _source_pixels(self) -> Float32s:
         """Where each pixel of the pinhole image comes from ``[H, W, 2]``."""
@@ -126,3 +118,7 @@ class Undistortion:
             block = np.asarray(self._camera.img_from_cam(rays)) * self._scale - 0.5
             pixels[top : top + at_once] = block.reshape(-1, width, 2)
         return pixels
+
+
+# For the next image of a camera, 9 bytes a pixel; those of many cameras would take more than the images.
+kept_maps = lru_cache(maxsize=8)(Undistortion.maps)

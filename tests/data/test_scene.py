@@ -24,6 +24,7 @@ from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.images import ImageHead
 from nsvq_lightning.data.reconstruct import reconstruct
 from nsvq_lightning.data.scene import load_scene, usable
+from nsvq_lightning.data.undistortion import kept_maps
 from nsvq_lightning.training.module import SplatModule
 
 SceneFactory = Callable[..., Path]
@@ -391,10 +392,8 @@ def test_pixels_that_a_wide_lens_never_saw_do_not_count(make_scene: SceneFactory
     scene = load_scene(root)
     undistortion = scene.images.sources[0].undistortion
     assert undistortion is not None
-    columns, rows, _ = undistortion.maps()
-    blank = np.zeros(columns.shape, bool)
+    _, _, blank = kept_maps(undistortion)
     blank[:4] = True
-    undistortion._maps = columns, rows, blank
     masked, kept = scene.view(0).mask, scene.view(1).mask
     assert kept is not None
     assert torch.equal(kept, torch.from_numpy(~blank))

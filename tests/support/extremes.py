@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nsvq_lightning.commands.benchmark.quantize import Attribute, step_errors
 from nsvq_lightning.commands.benchmark.quantize import step as quantize_step
-from nsvq_lightning.commands.benchmark.render import Painter, errors_of, gradients_of, painter, trace
+from nsvq_lightning.commands.benchmark.render import Painter, errors_of, painted, trace
 from nsvq_lightning.commands.benchmark.timing import number
 from nsvq_lightning.commands.benchmark.workloads import Workload
 from nsvq_lightning.quality.loss import photometric_loss
@@ -70,7 +70,7 @@ def beside(backend: str, planted: RawSplats) -> Painter:
 
     def paint(splats: RawSplats, workload: Workload) -> Tensor:
         every = (torch.cat([added.to(own.dtype), own]) for added, own in zip(planted, splats, strict=True))
-        return painter(backend)(RawSplats(*every), workload)
+        return painted(backend, RawSplats(*every), workload)
 
     return paint
 
@@ -79,8 +79,8 @@ def stress_errors(scene: Extreme, backend: str) -> dict[str, float]:
     """Errors of image and gradient in float32, or how many numbers of them are not finite, and how a step ends."""
     paint = beside(backend, scene.planted)
     traced = trace(scene.workload, paint, torch.float32)
-    gradients = gradients_of(traced, scene.workload.image_gradient)
-    broken = _not_finite((traced[0], *gradients.values()))
+    gradients = torch.autograd.grad(*traced, scene.workload.image_gradient)
+    broken = _not_finite((traced[0], *gradients))
     values: dict[str, float] = {}
     if not broken:
         truth = trace(scene.workload, beside("reference", scene.planted), torch.float64)
@@ -102,7 +102,7 @@ def step(scene: Extreme, backend: str) -> tuple[bool, Mapping[str, int], int]:
     optimizer = build_adam(param_groups(splats, {}, LearningRates(), extent=1.0))
     before, _ = trainable_rows(splats)
     photo = torch.rand(scene.workload.image_gradient.shape, generator=generator(0, 0, "photo"))
-    loss = photometric_loss(painter(backend)(splats.raw(), scene.workload), photo)
+    loss = photometric_loss(painted(backend, splats.raw(), scene.workload), photo)
     refused = not bool(loss.isfinite())
     if not refused:
         loss.backward()

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from nsvq_lightning.commands.benchmark import quantize
-from nsvq_lightning.commands.benchmark.render import painter
+from nsvq_lightning.commands.benchmark.render import painted
 from nsvq_lightning.commands.benchmark.timing import Measurement, Scope, compare
 from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.compression.stored import to_compressed
@@ -32,7 +32,7 @@ def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Measu
     writers: dict[str, Callable[[Path], int]] = {".ply": partial(save, splats)}
     for level in LEVELS:
         writers[f".nsvq {level}"] = partial(save, scene, storage=Storage(level))
-    look = torch.no_grad()(painter("auto"))
+    look = torch.no_grad()(partial(painted, "auto"))
     truths = {".ply": look(splats, workload), ".nsvq": look(scene.decode().raw(), workload)}
     writes = {}
     reads: dict[str, Callable[[], object]] = {}

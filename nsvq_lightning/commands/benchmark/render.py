@@ -38,14 +38,10 @@ def run(scope: Scope) -> Iterator[Measurement]:
         yield from _loss_rows(scope, device)
 
 
-def painter(backend: str) -> Painter:
-    """What renders with a back-end."""
-
-    def paint(splats: RawSplats, workload: Workload) -> Tensor:
-        background = workload.background.to(splats.means)
-        return render(splats, workload.camera, background=background, backend=backend).image
-
-    return paint
+def painted(backend: str, splats: RawSplats, workload: Workload) -> Tensor:
+    """Render with a back-end; without that argument, it is a :data:`Painter`."""
+    background = workload.background.to(splats.means)
+    return render(splats, workload.camera, background=background, backend=backend).image
 
 
 # Splats times pixels that the oracle is given, quick and full: half a minute on one core at most.
@@ -53,8 +49,8 @@ ORACLE_WORK = {True: 1e8, False: 6e9}
 
 
 def _render_rows(workload: Workload, scope: Scope, device: str) -> Iterator[Measurement]:
-    fast = {name: painter(name) for name in fast_backends(workload.splats.means)}
-    every = fast | {"plain torch": painter("reference")}
+    fast: dict[str, Painter] = {name: partial(painted, name) for name in fast_backends(workload.splats.means)}
+    every = fast | {"plain torch": partial(painted, "reference")}
     crop = workload
     while len(crop.splats.means) * crop.camera.width * crop.camera.height > ORACLE_WORK[scope.quick]:
         crop = workload.crop(crop.camera.width // 2, crop.camera.height // 2)
@@ -97,9 +93,9 @@ def errors_of(crop: Workload, paint: Painter, truth: Traced) -> dict[str, dict[s
     found = trace(crop, paint, torch.float32)
     image, usual = image_errors(found[0], truth[0])
     weights = crop.image_gradient * usual[..., None]
-    gradients = gradients_of(found, weights)
-    expected = gradients_of(truth, weights.double())
-    by_name = {name: relative_l2(gradient, expected[name]) for name, gradient in gradients.items()}
+    gradients = torch.autograd.grad(*found, weights)
+    expected = torch.autograd.grad(*truth, weights.double(), retain_graph=True)
+    by_name = dict(zip(RawSplats._fields, map(relative_l2, gradients, expected), strict=True))
     return {FORWARD: image, BOTH: {"gradient error": max(by_name.values()), **by_name}}
 
 
@@ -107,12 +103,6 @@ def trace(crop: Workload, paint: Painter, dtype: torch.dtype) -> Traced:
     """Render copies of the splats in a type, to be differentiated."""
     splats = RawSplats(*(tensor.to(dtype, copy=True).requires_grad_() for tensor in crop.splats))
     return paint(splats, crop), splats
-
-
-def gradients_of(traced: Traced, weights: Tensor) -> dict[str, Tensor]:
-    """Gradient by attribute of Σ weights · image."""
-    gradients = torch.autograd.grad(*traced, weights, retain_graph=True)
-    return dict(zip(RawSplats._fields, gradients, strict=True))
 
 
 def image_errors(image: Tensor, truth: Tensor) -> tuple[dict[str, float], Tensor]:

@@ -228,8 +228,6 @@ def _table(rows: Sequence[Measurement]) -> str:
 
 def number(value: float) -> str:
     """Three significant digits, counts in full: ``0.0123``, ``4.1e-07``, ``80,000``."""
-    if value == 0:
-        return "0"
     if value == round(value) and abs(value) < 1e15:
         return f"{value:,.0f}"
     if abs(value) < 1e-3 or abs(value) >= 1e7:
