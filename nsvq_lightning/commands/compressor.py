@@ -163,7 +163,7 @@ class Compressor:
         self._splats = detached(self.scene.decode())
         self._render = partial(render, antialiased=self.scene.antialiased)
         views = self.data.scene
-        self._views = [(index, views.cameras[index]) for index in views.some_train(MAX_VIEWS)]
+        self._views = {index: views.cameras[index] for index in views.some_train(MAX_VIEWS)}
         # Of settings without steps and shares, which need no training of their own.
         self._trained = cache(self._train)
         self._weights = cache(self._row_weights)
@@ -183,14 +183,14 @@ class Compressor:
 
     def _row_weights(self, setting: Setting) -> Tensor:
         """How much each splat counts where harmonics are put on a basis ``[N]``."""
-        cameras = [camera for _, camera in self._views]
-        return row_weights(contributions(self._trained(setting).decode(), cameras, self._render)).sqrt()
+        splats = self._trained(setting).decode()
+        return row_weights(contributions(splats, self._views.values(), self._render)).sqrt()
 
     def _likely_effects(self, setting: Setting) -> Tensor:
         """How much pictures are likely to change without each splat ``[N]``."""
         splats = below_cap(self._trained(setting).decode())
         squares = torch.zeros_like(splats.opacities)
-        for index, camera in self._views:
+        for index, camera in self._views.items():
             signs = generator(self.seed, 0, "signs", index)
             squares += sensitivity(splats, camera, self._render, signs)[0].opacities
         return likely_effects(splats, squares)

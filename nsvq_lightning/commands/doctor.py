@@ -217,13 +217,13 @@ def check_model(root: Path) -> Iterator[Finding]:
 
 def check_cameras(model: "ColmapModel") -> Iterator[Finding]:
     """Number, models and sizes of the cameras, and what distortion does to the corners."""
-    from nsvq_lightning.data.images import size_range
+    from nsvq_lightning.data.colmap import size_range
 
     photos = len(model.images)
-    cameras = [model.cameras[number] for number in {image.camera_id for image in model.images}]
+    cameras = model.cameras.values()
     sizes = {(camera.width, camera.height) for camera in cameras}
     names = sorted({camera.model_name for camera in cameras})
-    text = f"{len(cameras)} of {'/'.join(names)}, {size_range(sizes)}, for {photos} registered photos"
+    text = f"{len(cameras)} of {'/'.join(names)}, {size_range(cameras)}, for {photos} registered photos"
     advice = "more exact if one lens took them and COLMAP knows it (--ImageReader.single_camera 1)"
     many = len(cameras) > max(1, photos // 2) and len(sizes) <= 2
     yield judged("cameras", text, advice, when=model.source == "COLMAP" and many)
@@ -303,7 +303,8 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
 
 def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     """Whether files are of the size that the model says, and what becomes of those that lie on their side."""
-    from nsvq_lightning.data.images import same_shape, size_range
+    from nsvq_lightning.data.colmap import size_range
+    from nsvq_lightning.data.images import same_shape
     from nsvq_lightning.data.scene import OTHER_SHAPE
 
     sources = scene.images.sources
@@ -313,8 +314,7 @@ def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
         size = camera.width, camera.height
         others += not same_shape(source.size, size)
         scaled += source.size != size
-    used = size_range({(source.pinhole.width, source.pinhole.height) for source in sources})
-    text = f"trained at {used}; {others or scaled} of {len(sources)} files "
+    text = f"trained at {size_range(scene.cameras)}; {others or scaled} of {len(sources)} files "
     if others:
         yield Finding("problem", "sizes", f"{text}{OTHER_SHAPE}")
     else:
@@ -339,7 +339,7 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     if masked:
         left_out = 1 - sum(masked.values()) / len(masked)
         text = f"{len(masked)} of {count} photos have pixels that do not count, {100 * left_out:.0f} % of them"
-        most = min(masked, key=lambda name: masked[name])
+        most = min(masked, key=masked.__getitem__)
         advice = f"most in {most}; masks are white where the photo counts; if not, invert them"
         yield judged("masks", text, advice, when=left_out > 0.7)
     folder = scene.root / (model.images_folder or "images")

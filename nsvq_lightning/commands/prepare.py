@@ -96,9 +96,8 @@ def run(options: argparse.Namespace) -> int:
     if shown(check_folder(scene))["problem"]:
         return 1
     database = scene / reconstruct.DATABASE
-    size = database.stat().st_size / 1e6
     say(
-        f"\n{database} ({size:.0f} MB) saves time when photos are added, and may be deleted",
+        f"\n{database} ({database.stat().st_size / 1e6:.0f} MB) saves time when photos are added, and may be deleted",
         f"next: nsvq fit --data.root {shlex.quote(str(scene))}",
     )
     return 0

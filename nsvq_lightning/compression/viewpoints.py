@@ -34,14 +34,7 @@ def look_at(target: Float64s, eye: Float64s, width: int, height: int, angle: flo
     """
     view = view_towards(target, eye, np.array([0.0, -1.0, 0.0]))
     focal = 0.5 * width / math.tan(angle / 2)
-    intrinsics = torch.tensor(
-        [
-            [focal, 0, width / 2],
-            [0, focal, height / 2],
-            [0, 0, 1],
-        ],
-        dtype=torch.float64,
-    )
+    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
     near = NEARNESS * float(np.linalg.norm(target - eye))
     return Camera(intrinsics, view, width, height, near or NEAR)
 

@@ -53,8 +53,7 @@ class Block:
         """
         ground = points.astype(np.float64) @ np.array(self.axes).T
         low, high = (1 - share) * np.array(self.core) + share * np.array(self.around)
-        inside: Bools = ((ground >= low) & (ground < high)).all(1)
-        return inside
+        return np.asarray(((ground >= low) & (ground < high)).all(1))
 
     @classmethod
     def read(cls, folder: Path) -> "Block":
@@ -164,8 +163,7 @@ def cut(scene: Scene, count: int) -> list[Block]:
 def _quantiles(values: Float64s, weights: Float64s, shares: Sequence[float] | Float64s) -> Float64s:
     order = values.argsort()
     sums = weights[order].cumsum()
-    found: Float64s = values[order][sums.searchsorted(np.array(shares) * sums[-1])]
-    return found
+    return np.asarray(values[order][sums.searchsorted(np.array(shares) * sums[-1])])
 
 
 # What of the surroundings counts as at the seam.

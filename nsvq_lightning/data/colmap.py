@@ -6,7 +6,7 @@ The only place that imports pycolmap.
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Sequence, Sized
+from collections.abc import Callable, Iterable, Sequence, Sized
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePath
@@ -185,7 +185,7 @@ def _tables_in(folder: Path) -> dict[str, Path] | None:
     """The files of the tables in a folder, binary before text; None without cameras or images."""
     there = {path.name.lower(): path for path in folder.iterdir()} if folder.is_dir() else {}
     binary, text = (
-        {table: there[table.lower() + suffix] for table in TABLES if table.lower() + suffix in there}
+        {table: there[name] for table in TABLES if (name := table.lower() + suffix) in there}
         for suffix in (".bin", ".txt")
     )
     files = text if len(binary) < len(text) == len(TABLES) else text | binary
@@ -349,8 +349,13 @@ def lens(number: int, model: str, width: int, height: int, params: tuple[float, 
         *focal, cx, cy = params
         K = np.array([[focal[0], 0, cx], [0, focal[-1], cy], [0, 0, 1]], np.float64)
         return Pinhole(K, width, height, number)
-    pycolmap = import_pycolmap()
-    return pycolmap.Camera(model=model, width=width, height=height, params=list(params), camera_id=number)
+    return import_pycolmap().Camera(model=model, width=width, height=height, params=list(params), camera_id=number)
+
+
+def size_range(cameras: Iterable[Any]) -> str:
+    """The smallest and the largest size of cameras of any kind, in words."""
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    return " to ".join(f"{width}x{height}" for width, height in sorted({min(sizes), max(sizes)}))
 
 
 def rgb_bytes(values: Float64s, floats: bool = False) -> Uint8s:

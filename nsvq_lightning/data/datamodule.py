@@ -13,8 +13,8 @@ from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
 from lightning.pytorch.utilities import rank_zero_info
 from torch.utils.data import DataLoader, Dataset, IterableDataset
 
-from nsvq_lightning.data.colmap import SceneError
-from nsvq_lightning.data.images import Picture, size_range
+from nsvq_lightning.data.colmap import SceneError, size_range
+from nsvq_lightning.data.images import Picture
 from nsvq_lightning.data.scene import Factor, Scene, View, load_scene, usable
 from nsvq_lightning.random import generator
 
@@ -259,11 +259,11 @@ class _OrderedViews(Dataset[View]):
 
 def _summary(scene: Scene) -> str:
     """Size and split of a scene, and what of its photos does not count."""
-    size = size_range([(camera.width, camera.height) for camera in scene.cameras])
     names = [scene.names[i] for i in scene.test]
     shown = ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:3])}, …, {names[-1]}"
     text = (
-        f"{scene.root}: {len(scene)} views of {size}, {len(scene.points)} points, extent {scene.extent:.3g}; "
+        f"{scene.root}: {len(scene)} views of {size_range(scene.cameras)}, "
+        f"{len(scene.points)} points, extent {scene.extent:.3g}; "
         f"{len(scene.train)} train views, {len(scene.test)} test views ({scene.split}: {shown})"
     )
     if masked := sum(source.mask is not None for source in scene.images.sources):

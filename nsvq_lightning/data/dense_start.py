@@ -41,8 +41,7 @@ class _Photo(NamedTuple):
     def rays(self, pixels: Float64s) -> Float64s:
         """Unit directions ``[M, 3]`` in the world of pixels ``[M, 2]``."""
         local = np.concatenate([(pixels - self.centre) / self.focal, np.ones((len(pixels), 1))], 1)
-        rays: Float64s = local / np.linalg.norm(local, axis=1, keepdims=True) @ self.rotation
-        return rays
+        return np.asarray(local / np.linalg.norm(local, axis=1, keepdims=True) @ self.rotation)
 
 
 # Triangulated pixels: positions ``[M, 3]``, colours ``[M, 3]`` and detail ``[M]``, both in bytes.

@@ -1,7 +1,7 @@
 """From the file of a photo to the picture that a view is compared with, which is kept while a byte budget lasts."""
 
 import io
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,8 +69,7 @@ def read_image(path: Path) -> Uint8s:
         SceneError: The file is damaged or has floating-point pixels.
     """
     pixels = _to_bytes(_decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))
-    image: Uint8s = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
-    return image
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
 
 
 def _decoded(path: Path, flags: int) -> NDArray[Any]:
@@ -149,22 +148,15 @@ def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
     return difference < max(ROUNDED * one[1] * other[0], *other)
 
 
-def size_range(sizes: Collection[tuple[int, int]]) -> str:
-    """The smallest and the largest of sizes (width, height), in words."""
-    ends = sorted({min(sizes), max(sizes)})
-    return " to ".join(f"{width}x{height}" for width, height in ends)
-
-
-def read_mask(path: Path, width: int, height: int) -> Bools:
-    """Which pixels of a photo count ``[height, width]``: those that are more than half as bright as the brightest.
+def read_mask(path: Path, size: tuple[int, int]) -> Bools:
+    """Which pixels of a photo count ``[H, W]``: those that are more than half as bright as the brightest.
 
     So white and 1 are kept, in 8 or 16 bits, black is excluded. Where pixels are transparent, that is the mask; in
     colours, as of labels or of photos cut out, all counts that is not black. A mask of another size is scaled.
 
     Args:
         path: Image file.
-        width: Of the photo, pixels.
-        height: Of the photo, pixels.
+        size: Width and height of the photo, pixels.
 
     Raises:
         SceneError: The file is damaged, or has another aspect ratio than the photo.
@@ -179,12 +171,12 @@ def read_mask(path: Path, width: int, height: int) -> Bools:
     elif np.ptp(colours, axis=2).max() > levels.max() / 16:
         black = 1 / 32  # also after JPEG
     bright = levels > black * levels.max()
-    if not same_shape(bright.shape[::-1], (width, height)):
+    if not same_shape(bright.shape[::-1], size):
         raise SceneError(
-            f"mask {path} is of {bright.shape[1]}x{bright.shape[0]}, its photo of {width}x{height}, another shape: "
+            f"mask {path} is of {bright.shape[1]}x{bright.shape[0]}, its photo of {size[0]}x{size[1]}, another shape: "
             "make it from that photo, or remove it"
         )
-    kept = cv2.resize(bright.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    kept = cv2.resize(bright.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     return np.asarray(kept, bool)
 
 
@@ -258,7 +250,7 @@ class ImageSource:
         if (width, height) != self.size:
             raise _undecodable(self.path, f"decoded to {width}x{height}, its head says {self.size[0]}x{self.size[1]}")
         if self.mask is not None:
-            mask = read_mask(self.mask, width, height)
+            mask = read_mask(self.mask, self.size)
             kept = mask if kept is None else kept & mask
         if self.undistortion is not None:
             image, kept = self.undistortion(image, kept)

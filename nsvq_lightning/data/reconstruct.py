@@ -15,6 +15,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median_high
 from typing import Any
 
 import cv2
@@ -66,8 +67,8 @@ class Verdict:
             yield f"{apart}take more photos between"
         if not self.missing:
             return
-        placed = [sharpness(read_image(images / name)) for name in self.registered[:: max(1, count // MIN_PHOTOS)]]
-        usual = sorted(placed)[len(placed) // 2]
+        some_placed = self.registered[:: max(1, count // MIN_PHOTOS)]
+        usual = median_high(sharpness(read_image(images / name)) for name in some_placed)
         yield "  without a place, better taken again:"
         for name, partners in itertools.islice(self.missing.items(), MAX_NAMED):
             reason = f"shares enough with {partners} other photos" if partners else "overlaps no other"

@@ -13,10 +13,6 @@ from nsvq_lightning.splats.conventions import Bools, Float32s, Uint8s
 
 log = logging.getLogger(__name__)
 
-# Source column and row of each pixel, ``[H, W]``, in OpenCV's pixels (centres at integers), and which pixels the camera
-# never saw.
-Maps = tuple[Float32s, Float32s, Bools]
-
 
 def rectify(camera: Any, width: int, height: int) -> "tuple[Pinhole, Undistortion | None]":
     """Pinhole camera of the undistorted images, and how to undistort them (None if there is nothing to do).
@@ -90,8 +86,13 @@ class Undistortion:
             count &= cv2.remap(whole, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) == 255
         return result, None if count.all() else count
 
-    def maps(self) -> Maps:
-        """Where each pixel of the pinhole image comes from."""
+    def maps(self) -> tuple[Float32s, Float32s, Bools]:
+        """Where each pixel of the pinhole image comes from.
+
+        Returns:
+            Source column and row ``[H, W]``, in OpenCV's pixels (centres at integers), and which pixels the camera
+            never saw.
+        """
         pixels = self._source_pixels()
         # more than a pixel outside, or NaN where the ray leaves the domain of the camera model
         blank: Bools = np.any((pixels <= -1) | (pixels >= self._size) | np.isnan(pixels), axis=-1)

@@ -145,7 +145,7 @@ def test_a_chunk_longer_than_the_file_is_not_allocated(tmp_path: Path) -> None:
 def test_floating_point_pictures_are_refused(tmp_path: Path) -> None:
     assert cv2.imwrite(str(tmp_path / "deep.tiff"), RGB[..., 0].astype(np.float32))
     with pytest.raises(SceneError, match="float32"):
-        read_mask(tmp_path / "deep.tiff", 9, 6)
+        read_mask(tmp_path / "deep.tiff", (9, 6))
 
 
 KEPT = np.arange(9) >= np.full((6, 1), 4)
@@ -179,7 +179,7 @@ def _palette(indices: np.ndarray, colours: list[int]) -> PIL.Image.Image:
 )
 def test_masks_of_any_kind(tmp_path: Path, picture: PIL.Image.Image) -> None:
     picture.save(tmp_path / "mask.png")
-    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png", 9, 6), KEPT)
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png", (9, 6)), KEPT)
 
 
 @pytest.mark.parametrize(

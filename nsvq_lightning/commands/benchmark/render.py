@@ -127,8 +127,6 @@ def image_errors(image: Tensor, truth: Tensor) -> tuple[dict[str, float], Tensor
     return errors, usual
 
 
-# Of an image and a photo ``[H, W, 3]``, with the weight of D-SSIM.
-Loss = Callable[[Tensor, Tensor, float], Tensor]
 PHOTO = (533, 800, 3)
 
 
@@ -139,7 +137,7 @@ def _loss_rows(scope: Scope, device: str) -> Iterator[Measurement]:
     image = (photo / 255 + 0.01 + 0.1 * torch.rand(PHOTO, generator=draw)).to(device)
     photo = photo.to(device)
 
-    def gradient(loss: Loss, image: Tensor) -> Tensor:
+    def gradient(loss: Callable[[Tensor, Tensor, float], Tensor], image: Tensor) -> Tensor:
         image = image.detach().requires_grad_()
         return torch.autograd.grad(loss(image, photo, 0.2), image)[0]
 
