@@ -186,8 +186,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
 
     def psnr(keep: torch.Tensor) -> float:
         kept = type(splats)(*(tensor[keep] for tensor in splats))
-        tests = map(photos.view, photos.test)
-        return evaluate(lambda camera: look(kept, camera).image, tests, torch.device("cpu"))[0]
+        return evaluate(lambda camera: look(kept, camera).image, map(photos.view, photos.test), splats.means.device)[0]
 
     removed = floaters(splats, views, look)
     before, after = psnr(torch.ones_like(removed)), psnr(~removed)

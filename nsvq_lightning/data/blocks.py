@@ -123,7 +123,6 @@ def cut(scene: Scene, count: int) -> list[Block]:
     level = np.linalg.inv(turn_up(up_of(scene.cameras), "minus-y"))
     axes = level.T[[0, 2]]
     ground = points @ axes.T
-    root = str(scene.root.resolve())
 
     def parts(some: Bools, core: Float64s, around: Float64s, number: int) -> list[Block]:
         places = ground[some]
@@ -131,7 +130,7 @@ def cut(scene: Scene, count: int) -> list[Block]:
         if np.count_nonzero(weights) < 4 * number:
             raise SceneError(f"the photos show too few points of {scene.root} for {count} parts: ask for fewer")
         if number == 1:
-            return [Block(axes.tolist(), core.tolist(), around.tolist(), root)]
+            return [Block(axes.tolist(), core.tolist(), around.tolist(), str(scene.root.resolve()))]
         spread = [np.subtract(*_quantiles(column, weights, (0.95, 0.05))) for column in places.T]
         axis = np.argmax(spread)
         along = places[:, axis]

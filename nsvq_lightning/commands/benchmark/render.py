@@ -55,11 +55,7 @@ def _render_rows(workload: Workload, scope: Scope, device: str) -> Iterator[Meas
     while len(crop.splats.means) * crop.camera.width * crop.camera.height > ORACLE_WORK[scope.quick]:
         crop = workload.crop(crop.camera.width // 2, crop.camera.height // 2)
     truth = trace(crop, every["plain torch"], torch.float64)
-    pixels = {"error pixels": float(crop.camera.width * crop.camera.height)}
-    errors = {}
-    for name, paint in every.items():
-        by_operation = errors_of(crop, paint, truth)
-        errors[name] = {operation: pixels | found for operation, found in by_operation.items()}
+    errors = {name: errors_of(crop, paint, truth) for name, paint in every.items()}
 
     def timed(where: Workload, painters: dict[str, Painter]) -> Iterator[Measurement]:
         leaves = RawSplats(*(tensor.clone().requires_grad_() for tensor in where.splats))
@@ -83,7 +79,7 @@ def _both(paint: Painter, workload: Workload, leaves: RawSplats) -> None:
 
 
 def errors_of(crop: Workload, paint: Painter, truth: Traced) -> dict[str, dict[str, float]]:
-    """Errors of float32 by operation.
+    """Errors of float32 by operation, and of how many pixels.
 
     Args:
         crop: What is rendered.
@@ -96,7 +92,8 @@ def errors_of(crop: Workload, paint: Painter, truth: Traced) -> dict[str, dict[s
     gradients = torch.autograd.grad(*found, weights)
     expected = torch.autograd.grad(*truth, weights.double(), retain_graph=True)
     by_name = dict(zip(RawSplats._fields, map(relative_l2, gradients, expected), strict=True))
-    return {FORWARD: image, BOTH: {"gradient error": max(by_name.values()), **by_name}}
+    pixels = {"error pixels": float(crop.camera.width * crop.camera.height)}
+    return {FORWARD: {**pixels, **image}, BOTH: {**pixels, "gradient error": max(by_name.values()), **by_name}}
 
 
 def trace(crop: Workload, paint: Painter, dtype: torch.dtype) -> Traced:
