@@ -131,3 +131,49 @@ def test_tests_mirror_the_package() -> None:
         file = sources.get(room, PACKAGE / room).joinpath(*parts[:-1], name)
         mirrors = file.is_dir() or file.with_suffix(".py").is_file()
         assert mirrors or room == "properties", test
+
+
+DEFINITION = ast.FunctionDef | ast.ClassDef
+
+
+def _names(node: ast.AST) -> set[str]:
+    return {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+
+
+def _assigned(node: ast.stmt) -> set[str]:
+    targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+    return {each.id for target in targets for each in ast.walk(target) if isinstance(each, ast.Name)}
+
+
+def late_constants(source: str) -> set[str]:
+    """Loggers, and names that several definitions use, that are assigned after the first definition of a module.
+
+    Those that are made of a definition have to be.
+    """
+    body = ast.parse(source).body
+    definitions = [node for node in body if isinstance(node, DEFINITION)]
+    made_of = {node.name for node in definitions}
+    found = set()
+    for node in body[body.index(definitions[0]) :] if definitions else ():
+        names = _assigned(node)
+        if not names:
+            continue
+        if made_of & (_names(node) - names):
+            made_of |= names
+        elif "log" in names or sum(bool(names & _names(each)) for each in definitions) > 1:
+            found |= names
+    return found
+
+
+def test_what_several_definitions_share_stands_at_the_top() -> None:
+    found = {module: late_constants(path.read_text(encoding="utf-8")) for module, path in _files().items()}
+    assert not {module: names for module, names in found.items() if names}
+
+
+def test_a_constant_of_one_definition_may_stand_beside_it() -> None:
+    one = "def f(): ...\nA = 1\ndef g(): A\n"
+    assert late_constants(one) == set()
+    assert late_constants(one + "def h(): A\n") == {"A"}
+    assert late_constants("A = 1\ndef f(): A\ndef g(): A\n") == set()
+    assert late_constants("class C: ...\nA: C = C()\nB = [A]\ndef f(): A, B\ndef g(): A, B\n") == set()
+    assert late_constants("def f(): ...\nlog = 0\n") == {"log"}

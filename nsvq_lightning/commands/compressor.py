@@ -37,6 +37,9 @@ from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.training.trainer import SplatTrainer
 
+# Steps of spherical harmonics on a basis.
+STEPS = (0.2, 1.6)
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -58,8 +61,6 @@ class Setting:
     more: int = 0
 
 
-# Steps of spherical harmonics on a basis.
-STEPS = (0.2, 1.6)
 # Bits a splat from which on they are on a basis, without any codebooks.
 ON_BASIS = 125
 # Bits of a splat's position and opacity, about.

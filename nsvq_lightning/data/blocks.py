@@ -29,6 +29,9 @@ from nsvq_lightning.splats.conventions import Bools, Float64s, Uint8s
 
 BLOCK = "block.json"
 
+# Rows of points, and the cell of a picture that each is in.
+_Front = tuple[NDArray[np.intp], NDArray[np.intp]]
+
 
 @dataclass(frozen=True)
 class Block:
@@ -70,8 +73,6 @@ class Block:
 
 # Points up to so many times as far as the nearest one in the cell count as in front, too.
 FRONT = 1.05
-# Rows of points, and the cell of a picture that each is in.
-_Front = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
 def points_in_front(points: Float64s, camera: Camera) -> _Front:

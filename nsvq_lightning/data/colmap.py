@@ -23,6 +23,13 @@ from nsvq_lightning.splats.conventions import Float64s, Int64s, Uint8s
 
 log = logging.getLogger(__name__)
 
+# Upper bound on poses and intrinsics: their squares, which rendering computes in float32, stay finite.
+MAX_NUMBER = 1e18
+# Where a model may be inside a scene folder, in order of preference.
+FOLDERS = ("sparse/0", "sparse", ".")
+# The tables of a COLMAP model; a scene can do without the last one.
+TABLES = ("cameras", "images", "points3D")
+
 
 class SceneError(ValueError):
     """A scene folder that cannot be used; the message names the file, what is wrong with it and what to do."""
@@ -30,8 +37,6 @@ class SceneError(ValueError):
 
 # Pixels; a camera with a larger side is damaged.
 MAX_SIDE = (1 << 20) - 1
-# Upper bound on poses and intrinsics: their squares, which rendering computes in float32, stay finite.
-MAX_NUMBER = 1e18
 # Relative error of a quaternion's length that comes from writing its numbers with few digits.
 _ROUNDED = 1e-4
 
@@ -163,12 +168,6 @@ def check_name(name: str, source: object, allow_outside: bool = False) -> None:
             f"{source} names {name}, which is not in the scene folder: copy it there, or allow it in fit and test with "
             "--data.allow_outside=true"
         )
-
-
-# Where a model may be inside a scene folder, in order of preference.
-FOLDERS = ("sparse/0", "sparse", ".")
-# The tables of a COLMAP model; a scene can do without the last one.
-TABLES = ("cameras", "images", "points3D")
 
 
 def find_model(root: Path, folders: Sequence[str] = FOLDERS) -> dict[str, Path] | None:

@@ -15,6 +15,31 @@ import numpy as np
 
 from nsvq_lightning.splats.conventions import Float64s
 
+# Camera models in the order of COLMAP's numbers, and how many parameters each has.
+LENSES = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4,
+    "DIVISION": 5,
+    "SIMPLE_FISHEYE": 3,
+    "FISHEYE": 4,
+    "EUCM": 6,
+    "EQUIRECTANGULAR": 2,
+}
+# Identifier, position and colour of a point, then the images that saw it.
+_Point = tuple[int | float, ...]
+_U64 = struct.Struct("<Q")
+
 
 class CameraRow(NamedTuple):
     """A camera: its identifier, COLMAP's name of its model, width and height in pixels, parameters."""
@@ -47,29 +72,6 @@ class PointTable(NamedTuple):
     xyz: Float64s
     rgb: Float64s
     tracks: Sequence[Sequence[int]]
-
-
-# Camera models in the order of COLMAP's numbers, and how many parameters each has.
-LENSES = {
-    "SIMPLE_PINHOLE": 3,
-    "PINHOLE": 4,
-    "SIMPLE_RADIAL": 4,
-    "RADIAL": 5,
-    "OPENCV": 8,
-    "OPENCV_FISHEYE": 8,
-    "FULL_OPENCV": 12,
-    "FOV": 5,
-    "SIMPLE_RADIAL_FISHEYE": 4,
-    "RADIAL_FISHEYE": 5,
-    "THIN_PRISM_FISHEYE": 12,
-    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
-    "SIMPLE_DIVISION": 4,
-    "DIVISION": 5,
-    "SIMPLE_FISHEYE": 3,
-    "FISHEYE": 4,
-    "EUCM": 6,
-    "EQUIRECTANGULAR": 2,
-}
 
 
 def read_cameras(path: Path) -> list[CameraRow]:
@@ -128,10 +130,7 @@ def announced_rows(path: Path) -> int:
 
 
 _Row = TypeVar("_Row")
-# Identifier, position and colour of a point, then the images that saw it.
-_Point = tuple[int | float, ...]
 
-_U64 = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # identifier, model, width, height
 _IMAGE = struct.Struct("<I7dI")  # identifier, pose, camera; the name and the 2D points follow
 _POINT = struct.Struct("<Q3d3BdQ")  # identifier, position, colour, error, length of the track, which follows

@@ -15,6 +15,9 @@ from nsvq_lightning.data.scene import Scene, in_parallel
 from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Uint8s
 
+# Triangulated pixels: positions ``[M, 3]``, colours ``[M, 3]`` and detail ``[M]``, both in bytes.
+_Points = tuple[Float64s, Uint8s, Uint8s]
+
 
 class _Photo(NamedTuple):
     """A train photo at the size of its flow, and its pinhole camera."""
@@ -42,10 +45,6 @@ class _Photo(NamedTuple):
         """Unit directions ``[M, 3]`` in the world of pixels ``[M, 2]``."""
         local = np.concatenate([(pixels - self.centre) / self.focal, np.ones((len(pixels), 1))], 1)
         return np.asarray(local / np.linalg.norm(local, axis=1, keepdims=True) @ self.rotation)
-
-
-# Triangulated pixels: positions ``[M, 3]``, colours ``[M, 3]`` and detail ``[M]``, both in bytes.
-_Points = tuple[Float64s, Uint8s, Uint8s]
 
 
 # Candidates over all flows; of more pixels than that, every third, fourth, ... row and column is taken.

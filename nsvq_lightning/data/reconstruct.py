@@ -30,6 +30,16 @@ from nsvq_lightning.data.images import DAMAGED, ImageHead, read_image
 from nsvq_lightning.data.photo_files import PHOTOS
 from nsvq_lightning.io.atomic import write_bytes, write_text
 
+# Photos that are named; of the others, their number is.
+MAX_NAMED = 8
+DATABASE = "database.db"
+STAMPS = "photos.json"
+# Called with a step, how much of it is done, and how much there is.
+Report = Callable[[str, int, int], None]
+# Names of files, by the reason why they are left out.
+LeftOut = dict[str, list[str]]
+JPEG_QUALITY = 95
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -81,14 +91,8 @@ class Verdict:
 
 # Photos below which a scene is likely to look good only from where they were taken.
 MIN_PHOTOS = 20
-# Photos that are named; of the others, their number is.
-MAX_NAMED = 8
 # Files in a scene: what of it was made; features and matches; which photos were used.
 RECORD = "prepare.json"
-DATABASE = "database.db"
-STAMPS = "photos.json"
-# Called with a step, how much of it is done, and how much there is.
-Report = Callable[[str, int, int], None]
 
 
 def reconstruct(
@@ -342,8 +346,6 @@ RAW = (".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 # Names of folders that hold something else than photos, or the same photos again.
 OTHER = re.compile(r"\..*|__MACOSX|(.*_)?(masks?|depths?|normals?)|\.?thumb.*|images_\d+|sparse|runs", re.IGNORECASE)
-# Names of files, by the reason why they are left out.
-LeftOut = dict[str, list[str]]
 
 
 def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
@@ -408,7 +410,6 @@ TO_CONVERT = (
     "cannot be read: convert to JPEG, for example with 'magick mogrify -format jpg *.heic', or set the phone to \"most "
     "compatible\"; HEIC is read after 'pip install pillow-heif'"
 )
-JPEG_QUALITY = 95
 # What Pillow calls the formats of photos that stay without losses when they are converted, and those that COLMAP reads.
 LOSSLESS = ("PNG", "TIFF", "BMP")
 COLMAP_READS = ("JPEG", "MPO", *LOSSLESS)

@@ -38,6 +38,8 @@ from nsvq_lightning.splats.conventions import Bools, Float64s
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -291,7 +293,6 @@ def _head_for(path: Path, expected: tuple[int, int]) -> ImageHead:
 
 
 S = TypeVar("S")
-T = TypeVar("T")
 
 
 def in_parallel(function: Callable[[S], T], items: Sequence[S], title: str) -> list[T]:

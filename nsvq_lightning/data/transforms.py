@@ -24,6 +24,9 @@ from nsvq_lightning.splats.conventions import Float64s, Uint8s
 
 log = logging.getLogger(__name__)
 
+# A camera: COLMAP's name of the model, width and height in pixels, parameters.
+_Lens = tuple[str, int, int, tuple[float, ...]]
+
 
 def read_poses(
     root: Path, model: str | None = None, observations: bool = False, allow_outside: bool = False
@@ -94,8 +97,6 @@ def _numbers(values: object) -> Float64s:
         return np.zeros(())
 
 
-# A camera: COLMAP's name of the model, width and height in pixels, parameters.
-_Lens = tuple[str, int, int, tuple[float, ...]]
 # Cameras with distortion or without, of k1 to k3, p1 and p2; what is missing of these is 0.
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 

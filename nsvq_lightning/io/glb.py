@@ -25,6 +25,10 @@ log = logging.getLogger(__name__)
 EXTENSION = "KHR_gaussian_splatting"
 OPACITY = f"{EXTENSION}:OPACITY"
 
+# Magic, version, length of the file; then, of each chunk, length and type.
+_HEAD, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+
 
 def _harmonic(number: int) -> str:
     """Name of a coefficient, counted over all degrees from 0."""
@@ -32,11 +36,8 @@ def _harmonic(number: int) -> str:
     return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{number - degree * degree}"
 
 
-# Magic, version, length of the file; then, of each chunk, length and type.
-_HEAD, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _FLOAT, _BYTE, _ARRAY_BUFFER = 5126, 5121, 34962
 _COMPONENTS = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 def write_glb(path: StrPath, scene: CompressedScene) -> int:

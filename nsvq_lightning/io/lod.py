@@ -24,6 +24,9 @@ from nsvq_lightning.splats.conventions import Float64s, Integers, unit
 
 NAME = "lod-meta.json"
 
+# Most splats of the finest level in a leaf, and of any level in a file.
+LEAF, FILE = 1 << 14, 1 << 17
+
 
 def write_lod(
     path: StrPath,
@@ -97,10 +100,6 @@ def in_lod_order(scene: CompressedScene) -> CompressedScene:
     """The splats in the order of a file's finest level: leaf by leaf, in Morton order in each."""
     _, leaves = _tree([scene])
     return scene.take(np.concatenate([rows[0] for rows, _ in leaves]))
-
-
-# Most splats of the finest level in a leaf, and of any level in a file.
-LEAF, FILE = 1 << 14, 1 << 17
 
 
 def _tree(levels: Sequence[CompressedScene]) -> tuple[Json, list[tuple[list[Integers], Json]]]:

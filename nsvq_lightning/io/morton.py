@@ -14,6 +14,19 @@ from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int32s,
 # Bits per coordinate: three coordinates make a key of 63 bits.
 AXIS_BITS = 21
 
+# Masks of groups of 1, 2, 4, 8, 16 and 21 adjacent bits, with gaps of twice that length between.
+_MASKS = tuple(
+    map(
+        np.uint64,
+        (0x1249249249249249, 0x10C30C30C30C30C3, 0x100F00F00F00F00F, 0x1F0000FF0000FF, 0x1F00000000FFFF, 0x1FFFFF),
+    )
+)
+_SHIFTS = tuple(map(np.uint64, (2, 4, 8, 16, 32)))
+# Above every squared distance times the window.
+_NONE = 2.0**52
+# Rows before a row that are searched for neighbours. 64 instead of 16 would save another 0.05 of 8 bits of codes.
+_WINDOW = 16
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -100,17 +113,6 @@ def unmorton(keys: Uint64s) -> Int64s:
     return cells
 
 
-# Masks of groups of 1, 2, 4, 8, 16 and 21 adjacent bits, with gaps of twice that length between.
-_MASKS = tuple(
-    map(
-        np.uint64,
-        (0x1249249249249249, 0x10C30C30C30C30C3, 0x100F00F00F00F00F, 0x1F0000FF0000FF, 0x1F00000000FFFF, 0x1FFFFF),
-    )
-)
-
-_SHIFTS = tuple(map(np.uint64, (2, 4, 8, 16, 32)))
-
-
 @kernel
 def _interleave(cells, depths, keys):  # type: ignore[no-untyped-def]
     for i in range(len(keys)):
@@ -149,13 +151,6 @@ def nearest_before(cells: Int64s) -> Int32s:
     _search_before(np.ascontiguousarray(cells.T, np.float64), found)
     return found
 
-
-# Above every squared distance times the window.
-_NONE = 2.0**52
-
-
-# Rows before a row that are searched for neighbours. 64 instead of 16 would save another 0.05 of 8 bits of codes.
-_WINDOW = 16
 
 # Rows that are searched side by side.
 _BLOCK = 256

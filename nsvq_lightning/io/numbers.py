@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int32s, Uint8s
 
+# Logarithm that stands for that of an axis length of 0, which discs have: too thin to show, and not beyond any format's
+# range by more than it must be.
+FLAT = -20.0
+
 
 def opacity_of(logits: Float32s) -> Float64s:
     """Opacities in [0, 1] of logits of any shape."""
@@ -42,11 +46,6 @@ def bytes_of(logits: Float32s) -> Uint8s:
 def logits_of_bytes(levels: Uint8s) -> Float32s:
     """Finite logits of opacities given in 255ths."""
     return logits_of(np.arange(256) / 255)[levels]
-
-
-# Logarithm that stands for that of an axis length of 0, which discs have: too thin to show, and not beyond any format's
-# range by more than it must be.
-FLAT = -20.0
 
 
 def finite_logs(logs: Float32s) -> Float32s:

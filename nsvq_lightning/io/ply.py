@@ -28,6 +28,42 @@ from nsvq_lightning.splats.conventions import (
     unit,
 )
 
+_BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "half": "f2",
+    "float": "f4",
+    "double": "f8",
+}
+# Lowest bit and largest value of the numbers in each property of a compressed ``.ply``; opacities are in colours.
+_PACKED = {
+    "packed_position": ((21, 11, 0), (2047, 1023, 2047)),
+    "packed_rotation": ((20, 10, 0), (1023, 1023, 1023)),
+    "packed_scale": ((21, 11, 0), (2047, 1023, 2047)),
+    "packed_color": ((24, 16, 8, 0), (255, 255, 255, 255)),
+}
+# Those between whose values in a chunk the numbers are shares of the way; some files have none of colours.
+_BOUNDS = [
+    f"{end}_{name}"
+    for names in ("xyz", ("scale_x", "scale_y", "scale_z"), "rgb")
+    for end in ("min", "max")
+    for name in names
+]
+# Splats of a compressed ``.ply`` that follow each other and share a row of bounds.
+_CHUNK = 256
+# Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene.
+_ROWS = 1 << 12
+_RGB = ["red", "green", "blue"]
+# The normals of points, which other programs expect, are 0 unless an attribute is called so.
+_UNUSED = [] if any("nx" in attribute.ply.split() for attribute in ATTRIBUTES.values()) else ["nx", "ny", "nz"]
+# Order of the columns.
+_ORDER = tuple(dict.fromkeys(("means", "unused", "sh0", "shN", "opacities", "scales", "quats", *ATTRIBUTES)))
+
 
 @dataclass(frozen=True)
 class PlyHeader:
@@ -87,37 +123,7 @@ def read_ply_header(path: StrPath) -> PlyHeader:
     return header
 
 
-_BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
-_TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "half": "f2",
-    "float": "f4",
-    "double": "f8",
-}
 _TYPES |= {np.dtype(code).name: code for code in _TYPES.values()}  # int8, ...
-# Lowest bit and largest value of the numbers in each property of a compressed ``.ply``; opacities are in colours.
-_PACKED = {
-    "packed_position": ((21, 11, 0), (2047, 1023, 2047)),
-    "packed_rotation": ((20, 10, 0), (1023, 1023, 1023)),
-    "packed_scale": ((21, 11, 0), (2047, 1023, 2047)),
-    "packed_color": ((24, 16, 8, 0), (255, 255, 255, 255)),
-}
-# Those between whose values in a chunk the numbers are shares of the way; some files have none of colours.
-_BOUNDS = [
-    f"{end}_{name}"
-    for names in ("xyz", ("scale_x", "scale_y", "scale_z"), "rgb")
-    for end in ("min", "max")
-    for name in names
-]
-# Splats of a compressed ``.ply`` that follow each other and share a row of bounds.
-_CHUNK = 256
-# Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene.
-_ROWS = 1 << 12
 # Of a header; some programs write their cameras into its comments.
 _MAX_HEADER = 1 << 26
 
@@ -231,9 +237,6 @@ def splat_degree(header: PlyHeader) -> int:
         got = f"{len(rest)}, among them {strange[0]}" if strange else f"{len(rest)}"
         raise FormatError(f"SH degrees 0 to 3 have 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ...; got {got}")
     return shN_degree(len(rest) // 3)
-
-
-_RGB = ["red", "green", "blue"]
 
 
 def _needed(header: PlyHeader, sh_degree: int) -> dict[str, list[str]]:
@@ -404,12 +407,6 @@ def _for_each(bounds: Float32s, count: int) -> Float64s:
 def _unpacked(words: Uint32s, lowest: Sequence[int], largest: Sequence[int]) -> Float64s:
     """Numbers in words ``[N]``, from these bits on, as shares of the largest ``[N, len(lowest)]``."""
     return (words[:, None] >> np.array(lowest, np.uint32) & np.array(largest, np.uint32)) / largest
-
-
-# The normals of points, which other programs expect, are 0 unless an attribute is called so.
-_UNUSED = [] if any("nx" in attribute.ply.split() for attribute in ATTRIBUTES.values()) else ["nx", "ny", "nz"]
-# Order of the columns.
-_ORDER = tuple(dict.fromkeys(("means", "unused", "sh0", "shN", "opacities", "scales", "quats", *ATTRIBUTES)))
 
 
 def write_ply(path: StrPath, scene: CompressedScene) -> int:

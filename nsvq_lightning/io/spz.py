@@ -52,6 +52,28 @@ from nsvq_lightning.splats.conventions import Arrays, Float32s, Uint8s, Uint32s
 
 logger = logging.getLogger(__name__)
 
+_MAGIC, _GZIP = b"NGSP", b"\x1f\x8b"
+# Magic, version, N, SH degree, fractional bits, flags, and number of streams (0 up to version 3).
+_HEADER = struct.Struct("<4sIIBBBB")
+_TABLE_OFFSET = struct.Struct("<I12x")
+_HEAD = _HEADER.size + _TABLE_OFFSET.size
+# Compressed and uncompressed bytes of a stream.
+_ENTRY = struct.Struct("<QQ")
+# The flags of a scene that was trained with anti-aliasing, and of extensions.
+ANTIALIASED, _EXTENDED = 1, 2
+# Type and length, then the number of the axes.
+_EXTENSION = struct.Struct("<III")
+# The extension that states the axes.
+_AXES = 0xADBE0003
+# Where x, y and z point by the number that the extension holds, from 1: right or left, down or up, front or back. The
+# next eight, in which z is up or down, become these by a quarter turn.
+_SYSTEMS = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
+# Bits of a position, and the largest number of them that are fractional.
+_POSITION = 24
+MAX_FRACTION = 30
+_COLOR = 0.15
+DEFAULT_AXES = "rdf"
+
 
 @dataclass(frozen=True)
 class SpzHeader:
@@ -91,24 +113,8 @@ class SpzHeader:
         return {name: self.count * size for name, size in self.sizes.items() if self.count and size}
 
 
-_MAGIC, _GZIP = b"NGSP", b"\x1f\x8b"
-# Magic, version, N, SH degree, fractional bits, flags, and number of streams (0 up to version 3).
-_HEADER = struct.Struct("<4sIIBBBB")
-_TABLE_OFFSET = struct.Struct("<I12x")
-_HEAD = _HEADER.size + _TABLE_OFFSET.size
-# Compressed and uncompressed bytes of a stream.
-_ENTRY = struct.Struct("<QQ")
 # Bytes of extensions that are read; those in use have less than a hundred.
 _MAX_EXTENDED = 1 << 20
-# The flags of a scene that was trained with anti-aliasing, and of extensions.
-ANTIALIASED, _EXTENDED = 1, 2
-# Type and length, then the number of the axes.
-_EXTENSION = struct.Struct("<III")
-# The extension that states the axes.
-_AXES = 0xADBE0003
-# Where x, y and z point by the number that the extension holds, from 1: right or left, down or up, front or back. The
-# next eight, in which z is up or down, become these by a quarter turn.
-_SYSTEMS = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
 # Coordinates that the real spherical harmonics of degree 1 to 3 are odd functions of.
 _ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 
@@ -240,11 +246,6 @@ def _inflate(gunzip: "zlib._Decompress", data: bytes, most: int) -> bytes:
         raise FormatError(f"damaged: no valid gzip stream ({error})") from None
 
 
-# Bits of a position, and the largest number of them that are fractional.
-_POSITION = 24
-MAX_FRACTION = 30
-
-
 def _parse(start: bytes, file_bytes: int) -> SpzHeader:
     """Header of any version; refuses more splats than a file of that many bytes can hold."""
     if len(start) < _HEADER.size or start[:4] != _MAGIC:
@@ -284,15 +285,11 @@ def in_spz_order(scene: CompressedScene) -> CompressedScene:
     return scene.take(np.lexsort([np.arange(len(scene)), *codes]))
 
 
-_COLOR = 0.15
-
-
 # Versions that are written; every reader of the format supports the default.
 SPZ_VERSIONS = (3, 4)
 DEFAULT_VERSION = 3
 # Axes that are written; viewers take a file to have the default, whatever it says.
 SPZ_AXES = ("rdf", "rub")
-DEFAULT_AXES = "rdf"
 
 
 def write_spz(

@@ -23,13 +23,17 @@ from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.splats.splats import SplatTensors
 
+Color = Sequence[float]  # RGB in [0, 1]
+_LENS = ("fx", "fy", "cx", "cy")
+# File whose time of modification says when a viewer last asked.
+REQUEST = "live.request"
+
 
 def some_cameras(scene: Scene) -> dict[str, Camera]:
     """Cameras of at most 300 photos by name, evenly spaced."""
     return dict(list(zip(scene.names, scene.cameras, strict=True))[:: -(-len(scene) // 300)])
 
 
-Color = Sequence[float]  # RGB in [0, 1]
 # RGB of the backgrounds that have names.
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -133,9 +137,6 @@ def best_view(splats: SplatTensors, cameras: Sequence[Camera]) -> int:
     return max(range(len(cameras)), key=lambda place: shown(cameras[place]))
 
 
-_LENS = ("fx", "fy", "cx", "cy")
-
-
 def camera_entry(camera: Camera) -> dict[str, Any]:
     """A camera as the page's JSON has it.
 
@@ -205,8 +206,6 @@ def script_json(value: Any) -> str:
 
 # The splats of a running fit, while somebody looks.
 LIVE_SCENE = "live.nsvq"
-# File whose time of modification says when a viewer last asked.
-REQUEST = "live.request"
 
 
 def ask_live(folder: Path) -> None:

@@ -41,6 +41,17 @@ _ORDER = (*_EARLY, "means", *_LATE)
 _LONGEST_FIRST = _LATE[::-1]
 _GRID = struct.Struct("<qqqd")
 
+# Encodings of the streams that an attribute has, by its storage and the ends of their names.
+_STREAMS = {
+    "levels": {"": "paths"},
+    "steps": {"": "integers"},
+    "components": {".basis": "integers", "": "integers"},
+    "codes": {".codebook": "integers", "": "paths"},
+    "cells": {".grid": "grid", "": "keys", ".far": "float32"},
+}
+# The end of the name of the stream with the table that an attribute's values refer to.
+_TABLES = {"codes": ".codebook", "components": ".basis"}
+
 
 def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header, dict[str, bytes]]:
     """Header and streams of a scene.
@@ -139,23 +150,9 @@ def _neighbours(keys: Uint64s, depths: Int64s, count: int) -> Int32s:
     return neighbours
 
 
-# Encodings of the streams that an attribute has, by its storage and the ends of their names.
-_STREAMS = {
-    "levels": {"": "paths"},
-    "steps": {"": "integers"},
-    "components": {".basis": "integers", "": "integers"},
-    "codes": {".codebook": "integers", "": "paths"},
-    "cells": {".grid": "grid", "": "keys", ".far": "float32"},
-}
-
-
 def _stream_names(attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, str]]:
     """Name and encoding of the streams that the attributes have."""
     return [(entry.name + end, kind) for entry in attributes for end, kind in _STREAMS[entry.storage].items()]
-
-
-# The end of the name of the stream with the table that an attribute's values refer to.
-_TABLES = {"codes": ".codebook", "components": ".basis"}
 
 
 def _encoded(attribute: rounding.Stored, order: Int64s, neighbours: Int32s) -> dict[str, bytes]:

@@ -25,6 +25,20 @@ _MODELLED_BITS = 16
 # What two neighbours say about a decision: each one has left the path before, takes 0 here, or takes 1 here.
 _RELATIONS = 9
 
+_START = uint64(0xFFFFFFFFFFFFFFFF)
+# Integers are below it in size: they and their sums are exact in float64.
+_TOO_LARGE = 1 << 52
+_KEY_MASK = uint64((1 << KEY_BITS) - 1)
+# What a reader returns instead of the number of words when it meets a value out of range.
+_OUTSIDE = -1
+# Decisions that encode a number's bit length, 0 to 63.
+_LENGTH_BITS = 6
+# Number of size classes of the previous difference.
+_BEFORE = 11
+_KEY_CONTEXTS = (KEY_BITS + 1) * _BEFORE << _LENGTH_BITS
+# Contexts per column: the tree of the lengths, and the second bit by length.
+_INTEGER_CONTEXTS = 2 << _LENGTH_BITS
+
 
 def encode_paths(paths: Int64s, bits: int, neighbours: Int32s) -> bytes:
     """Bytes of paths ``[N]`` of ``bits`` decisions each, the first one in the highest bit.
@@ -68,14 +82,6 @@ def decode_paths(data: bytes | memoryview, bits: int, neighbours: Int32s) -> Int
     used = _read_paths(words, bits, neighbours, paths, rc.new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
     _check_used(words, used)
     return paths
-
-
-_START = uint64(0xFFFFFFFFFFFFFFFF)
-# Integers are below it in size: they and their sums are exact in float64.
-_TOO_LARGE = 1 << 52
-_KEY_MASK = uint64((1 << KEY_BITS) - 1)
-# What a reader returns instead of the number of words when it meets a value out of range.
-_OUTSIDE = -1
 
 
 def encode_keys(keys: Uint64s, depths: Int64s) -> bytes:
@@ -239,9 +245,6 @@ def _read_paths(words, bits, neighbours, paths, contexts):  # type: ignore[no-un
 
 # Lengths of numbers
 
-# Decisions that encode a number's bit length, 0 to 63.
-_LENGTH_BITS = 6
-
 
 @inline
 def _length(size):  # type: ignore[no-untyped-def]
@@ -284,10 +287,6 @@ def _read_length(start, contexts, code, width, words, used):  # type: ignore[no-
 
 
 # Keys
-
-# Number of size classes of the previous difference.
-_BEFORE = 11
-_KEY_CONTEXTS = (KEY_BITS + 1) * _BEFORE << _LENGTH_BITS
 
 
 @inline
@@ -335,9 +334,6 @@ def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
 
 
 # Integers
-
-# Contexts per column: the tree of the lengths, and the second bit by length.
-_INTEGER_CONTEXTS = 2 << _LENGTH_BITS
 
 
 def _bit_lengths(values: Int64s) -> Int64s:

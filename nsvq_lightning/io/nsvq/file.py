@@ -14,6 +14,9 @@ from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, listed
 from nsvq_lightning.splats.conventions import Float32s, Integers, Uint32s
 
+# Attributes in file order.
+_ORDER = ("means", "opacities", *QUANTIZABLE)
+
 
 def encode(scene: CompressedScene, storage: Storage) -> tuple[Header, dict[str, bytes]]:
     """Header and streams of a scene; the same arguments give the same bytes.
@@ -95,10 +98,6 @@ def decode(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene
     if header.level == "paper":
         return decode_paper(header, streams)
     raise FormatError(f"level {header.level!r}; this release reads {', '.join(LEVELS)}", "update nsvq-lightning")
-
-
-# Attributes in file order.
-_ORDER = ("means", "opacities", *QUANTIZABLE)
 
 
 def pack_fields(fields: Sequence[Integers], widths: Sequence[int]) -> bytes:

@@ -22,6 +22,16 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, Json, naming_file
 from nsvq_lightning.splats.attributes import attribute_dims
 
+# Magic, BLAKE2b digest of everything after it, version, and bytes of the JSON, whose keys are sorted, without spaces.
+_PREFIX = struct.Struct("<8s16sII")
+_T = TypeVar("_T")
+# Types of the numbers of JSON; a bool is none.
+_NUMBERS = (int, float)
+# Its line ends and high bit expose transfers that treat it as text.
+MAGIC = b"\x89NSVQ\r\n\x1a"
+# Versions that are read. A file has the first one unless an attribute has what came with the second: a basis.
+VERSIONS = 2, 3
+
 
 class AttributeEntry(NamedTuple):
     """How one attribute of the splats is stored.
@@ -62,8 +72,6 @@ class StreamEntry(NamedTuple):
     encoding: str
 
 
-# Magic, BLAKE2b digest of everything after it, version, and bytes of the JSON, whose keys are sorted, without spaces.
-_PREFIX = struct.Struct("<8s16sII")
 _DIGEST_END = 24
 
 
@@ -181,11 +189,6 @@ def _no_number(name: str) -> None:
     raise ValueError(f"it holds {name}, which JSON does not have")
 
 
-_T = TypeVar("_T")
-# Types of the numbers of JSON; a bool is none.
-_NUMBERS = (int, float)
-
-
 def _entry(table: object, key: str, kind: type[_T]) -> _T:
     """An entry of a type; numbers must be finite and not negative."""
     value: Any = table.get(key) if isinstance(table, dict) else None
@@ -212,12 +215,6 @@ def _origin(values: list[Any]) -> tuple[float, float, float]:
         raise FormatError("damaged: header entry 'origin' must be three finite numbers")
     x, y, z = map(float, values)
     return x, y, z
-
-
-# Its line ends and high bit expose transfers that treat it as text.
-MAGIC = b"\x89NSVQ\r\n\x1a"
-# Versions that are read. A file has the first one unless an attribute has what came with the second: a basis.
-VERSIONS = 2, 3
 
 
 def frame(header: Header, streams: Mapping[str, bytes]) -> list[bytes]:

@@ -16,6 +16,11 @@ from nsvq_lightning.splats.conventions import Uint32s
 # Number of bits after which the probability of a context moves at its slowest.
 COUNT_LIMIT = 126
 
+_FULL = uint64(0xFFFFFFFFFFFFFFFF)
+_LOW_WORD = uint64(0xFFFFFFFF)
+# Largest number of bits written at once without a model.
+PLAIN_BITS = 16
+
 
 def new_contexts(count: int) -> Uint32s:
     """States ``[count]``: the probability of a 1 in 65536ths times 256, plus how many bits were met."""
@@ -40,10 +45,6 @@ def _learn(bit, context, contexts):
     target = _MIN_CHANCE + np.int64(bit) * (65536 - 2 * _MIN_CHANCE)
     chance += ((target - chance) * _RATES[n]) >> 16
     contexts[context] = uint32((chance << 8) + n + (n < COUNT_LIMIT))
-
-
-_FULL = uint64(0xFFFFFFFFFFFFFFFF)
-_LOW_WORD = uint64(0xFFFFFFFF)
 
 
 @inline
@@ -79,10 +80,6 @@ def encode_bit(bit, context, contexts, low, width, words, used):
         _carry(words, used)
     _learn(bit, context, contexts)
     return _shift_out(low, width, words, used)
-
-
-# Largest number of bits written at once without a model.
-PLAIN_BITS = 16
 
 
 @inline
