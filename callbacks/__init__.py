@@ -12,6 +12,7 @@ from .outputs import ExportScene, LiveScene, RenderWriter
 from .progress import SplatProgressBar
 from .pruning import OpacityRegularization, SplatSelection
 from .quantization import (
+    CanonicalCovariance,
     CodebookInit,
     CodebookRefit,
     CodebookReplacement,
@@ -27,6 +28,7 @@ __all__ = [
     "OPTIONAL",
     "STANDARD",
     "BudgetedGrowth",
+    "CanonicalCovariance",
     "CodebookInit",
     "CodebookRefit",
     "CodebookReplacement",

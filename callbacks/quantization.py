@@ -18,6 +18,7 @@ from nsvq_lightning.quantize import attributes
 from nsvq_lightning.quantize.codebook import Quantizer, held_codes
 from nsvq_lightning.quantize.nearest import cheapest, code_rates
 from nsvq_lightning.random import generator
+from nsvq_lightning.splats.splats import canonical
 from nsvq_lightning.training import distributed, optim, row_ops, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
@@ -26,6 +27,40 @@ from .base import SplatCallback, finite_search_is_due, first_time, keep_finite_s
 from .settings import Count, Factor, Positive
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(eq=False)
+class CanonicalCovariance(SplatCallback):
+    """After the last iteration before the quantize phase, gives like covariances like scales and rotations.
+
+    Of the 48 equivalent pairs of scale and rotation that a covariance has, each splat takes one
+    (:func:`nsvq_lightning.splats.splats.canonical`), so that k-means groups them; renderings do not change. The form
+    is not enforced afterwards: rows move continuously and keep their codes, while a row that jumped to another
+    equivalent pair would lose its code.
+
+    With 4k codes on 187 k splats, right after k-means for scales and rotations, test PSNR was 30.47 dB without and
+    31.17 dB with it, against 31.64 dB unquantized.
+    """
+
+    def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
+        """Act before the first iteration of a run that starts in the quantize phase."""
+        if first_time(self, "after", trainer.global_step):
+            self.after_step(trainer, module, trainer.global_step)
+
+    def is_due(self, module: SplatModule, iteration: int) -> bool:
+        """Whether it is the last iteration before the quantize phase, whose first one all callbacks may handle."""
+        return iteration + 1 == module.schedule.first_of(Phase.QUANTIZE)
+
+    @torch.no_grad()
+    def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
+        """Act when due, if scales or rotations are quantized."""
+        if module.quantizers.keys().isdisjoint(("scales", "quats")) or not self.is_due(module, iteration):
+            return
+        optimizer, splats = trainer.optimizers[0], module.splats
+        new = canonical(splats.scales.detach(), splats.quats.detach())
+        row_ops.change_coordinates(splats, optimizer, "scales", new.scales, new.scale_maps)
+        row_ops.change_coordinates(splats, optimizer, "quats", new.quats, new.quat_maps)
+        log.info("iteration %d: each covariance as one of its 48 pairs of scale and rotation", iteration)
 
 
 def perplexity(usage: Tensor) -> float:

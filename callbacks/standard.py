@@ -10,8 +10,9 @@ from nsvq_lightning.top_level import folder_of
 
 from . import checkpoint, growth, outputs, progress, pruning, quantization, report, schedule
 
-# Callback by name. The length of a run in minutes depends on the budget; codebooks are placed, and codes replaced,
-# before rate and distortion choose among them.
+# Callback by name. The length of a run in minutes depends on the budget. Density control comes before the canonical
+# form, which may act after the same iteration; codebooks are placed, and codes replaced, before rate and distortion
+# choose among them.
 STANDARD: dict[str, type[Callback]] = {
     "budget": growth.SplatBudget,
     "phases": schedule.PhaseSchedule,
@@ -20,6 +21,7 @@ STANDARD: dict[str, type[Callback]] = {
     "density": growth.BudgetedGrowth,
     "selection": pruning.SplatSelection,
     "opacity": pruning.OpacityRegularization,
+    "canonical": quantization.CanonicalCovariance,
     "codebook_init": quantization.CodebookInit,
     "codebook_refit": quantization.CodebookRefit,
     "codebook_replacement": quantization.CodebookReplacement,

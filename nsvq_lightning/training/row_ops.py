@@ -22,8 +22,9 @@ log = logging.getLogger(__name__)
 # shows larger splats, so nothing would ever train or prune them.
 MAX_LOG_SCALE = 32.0
 
+FIRST_MOMENT = "exp_avg"
 # Per-row state of Adam; everything else in its state belongs to the whole parameter.
-MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq")
+MOMENTS = (FIRST_MOMENT, "exp_avg_sq", "max_exp_avg_sq")
 
 
 def append_rows(splats: Splats, optimizer: Optimizer, new: Mapping[str, Tensor]) -> None:
@@ -85,6 +86,32 @@ def replace_attribute(splats: Splats, optimizer: Optimizer, name: str, values: T
     if values.shape != parameter.shape:
         raise ValueError(f"{name} must keep its shape {list(parameter.shape)}, got {list(values.shape)}")
     _rebind(splats, optimizer, name, values.detach().to(parameter), lambda moment: moment)
+
+
+def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: Tensor, maps: Tensor) -> None:
+    """Overwrite all rows of one attribute with other coordinates of the same splats, and transform the moments.
+
+    The mean of gradients becomes ``maps · mean``, that of their squares ``maps² · mean``, which is exact where a map
+    only permutes and scales components, and otherwise assumes that they are uncorrelated.
+
+    Args:
+        splats: The ``N`` splats.
+        optimizer: Their optimiser.
+        name: The attribute, with rows of D columns.
+        values: Its rows ``[N, D]`` in the new coordinates.
+        maps: ``[N, D, D]``; maps a gradient with respect to the old coordinates to one with respect to the new.
+
+    Raises:
+        ValueError: The shape of ``values`` or ``maps`` does not fit the attribute.
+    """
+    if maps.shape != (*values.shape, values.shape[-1]):
+        raise ValueError(f"maps of {name} must be {[*values.shape, values.shape[-1]]}, got {list(maps.shape)}")
+    replace_attribute(splats, optimizer, name, values)
+    state = optimizer.state.get(find_group(optimizer, name)["params"][0], {})
+    for key in MOMENTS:
+        if key in state:
+            factors = maps if key == FIRST_MOMENT else maps.square()
+            state[key] = (factors * state[key][:, None, :]).sum(2)
 
 
 def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -> None:

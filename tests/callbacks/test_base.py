@@ -13,6 +13,7 @@ from lightning.pytorch import Callback, LightningModule
 from nsvq_lightning import callbacks
 from nsvq_lightning.callbacks import (
     BudgetedGrowth,
+    CanonicalCovariance,
     CodebookInit,
     CodebookRefit,
     CodebookReplacement,
@@ -120,6 +121,7 @@ DUE: list[tuple[SplatCallback, Iterable[int]]] = [
     (BudgetedGrowth(start=300), range(400, 15_001, 100)),
     (SplatSelection(), [15_001]),
     (OpacityRegularization(), range(15_001, 20_001)),
+    (CanonicalCovariance(), [20_000]),
     (CodebookInit(), [20_001]),
     (FreezeCodes(), [43_001]),
     (MetricReport(every=0), [15_000, 20_000, 43_000, 45_000]),

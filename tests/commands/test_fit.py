@@ -299,7 +299,7 @@ def test_the_papers_settings_survive_another_class(capsys: pytest.CaptureFixture
     assert config["model"]["quantizer"]["class_path"].endswith("PostHoc")
     assert config["model"]["rates"]["shN"] == 0.000125
     callbacks = config["callbacks"]
-    assert [callbacks[name] for name in ("rate_decay", "budget", "selection")] == [None] * 3
+    assert [callbacks[name] for name in ("rate_decay", "budget", "selection", "canonical")] == [None] * 4
     assert callbacks["phases"]["init_args"]["quantize_end"] == 43_000
     assert callbacks["density"]["class_path"].endswith("DensityControl")
     assert callbacks["density"]["init_args"]["start"] == 600

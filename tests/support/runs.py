@@ -13,6 +13,7 @@ from lightning.pytorch import Callback, LightningDataModule, LightningModule, Tr
 
 from nsvq_lightning.callbacks import (
     BudgetedGrowth,
+    CanonicalCovariance,
     CodebookInit,
     CodebookReplacement,
     LearningRateDecay,
@@ -68,6 +69,7 @@ def recipe_options(**replaced: Callback | None) -> dict[str, Callback | None]:
         "selection": SplatSelection(),
         "opacity": None,
         "rate_decay": LearningRateDecay(start=50),
+        "canonical": CanonicalCovariance(),
         "codebook_init": CodebookInit(),
         "codebook_refit": None,
         "codebook_replacement": CodebookReplacement(start=43, early_end=45, early_every=2, end=47, late_every=2),

@@ -13,6 +13,7 @@ from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.training.row_ops import (
     append_rows,
+    change_coordinates,
     drop_non_finite,
     keep_rows,
     replace_attribute,
@@ -119,6 +120,35 @@ def test_replaced_values_keep_their_moments() -> None:
     replace_attribute(splats, optimizer, "opacities", torch.zeros(3))
     assert not splats.opacities.any()
     assert torch.equal(state_of(splats, optimizer, "opacities")["exp_avg"], moment)
+
+
+def test_moments_follow_into_other_coordinates() -> None:
+    """After steps on x the moments become those that steps on y = P·x/4 give, P a permutation with a sign."""
+    swap = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    start = make(4)
+
+    def step(splats: Splats, optimizer: torch.optim.Adam, weight: float, to_x: Tensor) -> None:
+        optimizer.zero_grad()
+        (weight * (splats.scales @ to_x.T).pow(3)).sum().backward()
+        optimizer.step()
+
+    changed = make(4)
+    optimizer = build_adam(param_groups(changed, {}, LearningRates(scales=0.0), extent=1.0))
+    for weight in (1.0, -2.0, 0.5):
+        step(changed, optimizer, weight, torch.eye(3))
+    change_coordinates(changed, optimizer, "scales", start.scales @ swap.T / 4, (4 * swap).expand(4, 3, 3))
+
+    always = make(4)
+    other = build_adam(param_groups(always, {}, LearningRates(scales=0.0), extent=1.0))
+    replace_attribute(always, other, "scales", start.scales @ swap.T / 4)
+    for weight in (1.0, -2.0, 0.5):
+        step(always, other, weight, 4 * swap.T)
+
+    for key in ("exp_avg", "exp_avg_sq"):
+        found, expected = (state_of(s, o, "scales")[key] for s, o in ((changed, optimizer), (always, other)))
+        torch.testing.assert_close(found, expected)
+    with pytest.raises(ValueError, match=r"maps of scales must be \[4, 3, 3\]"):
+        change_coordinates(changed, optimizer, "scales", start.scales, swap)
 
 
 def test_non_finite_splats_are_dropped_and_named(caplog: pytest.LogCaptureFixture) -> None:

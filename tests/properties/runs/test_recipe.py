@@ -10,12 +10,13 @@ import pytest
 import torch
 import yaml
 from checkpoints import assert_same_end
-from lightning.pytorch import Callback, Trainer
+from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import BUDGET, ENDS, RECIPE_MODULE, Recipe, RunFactory, Whole, paper_replacement, recipe_options
 from torch import Tensor
 
 from nsvq_lightning.callbacks import (
     BudgetedGrowth,
+    CanonicalCovariance,
     CodebookInit,
     LearningRateDecay,
     PhaseSchedule,
@@ -31,6 +32,7 @@ from nsvq_lightning.io.formats import load
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.nearest import code_rates
+from nsvq_lightning.rendering.reference import rotation_matrices
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import run_folder
 from nsvq_lightning.training.schedule import Phase
@@ -65,7 +67,7 @@ def test_rates_fall_at_the_end(fast: Whole) -> None:
 def test_the_order_of_callbacks_matters_only_where_it_is_said_to(fast: Whole, run: RunFactory, recipe: Recipe) -> None:
     callbacks = recipe(**recipe_options())
     # Each needs the one before, or acts at the same time.
-    first = ["budget", "density", "codebook_init", "codebook_replacement"]
+    first = ["budget", "density", "canonical", "codebook_init", "codebook_replacement"]
     names = [*first, *(name for name in reversed(callbacks) if name not in first)]
     assert scene_bytes(run([callbacks[name] for name in names], module=RECIPE_MODULE)[0]) == fast.scene
 
@@ -181,6 +183,43 @@ def test_few_splats_get_few_codes(run: RunFactory, recipe: Recipe) -> None:
             assert len(quantizer.codebook) == min(most, asked[name])
             assert int(quantizer.codes.max()) < len(quantizer.codebook)
         assert len(module.quantizers["shN"].codebook) < asked["shN"]
+
+
+class Look(Callback):
+    """Keeps scales and quaternions before and after the last iteration before the quantize phase."""
+
+    def __init__(self, iteration: int) -> None:
+        self.iteration = iteration
+        self.seen: list[tuple[Tensor, Tensor]] = []
+
+    def _look(self, trainer: Trainer, module: LightningModule, *_: Any) -> None:
+        assert isinstance(module, SplatModule)
+        if trainer.global_step == self.iteration:
+            self.seen.append((module.splats.scales.detach().clone(), module.splats.quats.detach().clone()))
+
+    on_train_batch_end = on_before_zero_grad = _look
+
+
+def test_rows_are_canonical_when_codebooks_are_placed(run: RunFactory, recipe: Recipe) -> None:
+    look = Look(9)  # first in the list, so that it sees them before and after
+    _, module = run([look, *recipe(canonical=CanonicalCovariance()).values()], max_steps=20)
+    assert module.schedule.first_of(Phase.QUANTIZE) == 10
+    before, after = look.seen
+    axes = [rotation_matrices(quats.double()) * scales.double().exp()[:, None] for scales, quats in look.seen]
+    first, second = (a @ a.mT for a in axes)
+    assert ((second - first).norm(dim=(1, 2)) / first.norm(dim=(1, 2))).max() < 1e-5
+    assert (before[0].diff(dim=1) > 0).any()
+    assert (after[0].diff(dim=1) <= 0).all()
+    torch.testing.assert_close(after[1].norm(dim=1), torch.ones(len(after[1])))
+
+
+def test_a_run_that_starts_with_codebooks_starts_canonical(
+    run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
+) -> None:
+    phases = PhaseSchedule(warmup_end=0, prune_end=0)
+    with caplog.at_level("INFO"):
+        run(recipe(phases=phases, canonical=CanonicalCovariance()).values(), max_steps=4)
+    assert caplog.text.count("iteration 0: each covariance") == 1
 
 
 class Recording(NSVQ):

@@ -16,6 +16,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import RECIPE_MODULE, Recipe, RunFactory, Whole, Witness, paper_phases, paper_replacement, recipe_options
 
 from nsvq_lightning.callbacks import (
+    CanonicalCovariance,
     CodebookInit,
     CodebookRefit,
     FiniteCodes,
@@ -304,11 +305,12 @@ def test_a_loss_that_is_known_only_after_the_backward_pass_changes_no_bit(
 def test_codebooks_are_placed_on_finite_splats(
     with_density: bool, run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
 ) -> None:
-    callbacks = recipe(codebook_init=CodebookInit(weights="contribution"))
+    callbacks = recipe(codebook_init=CodebookInit(weights="contribution"), canonical=None)
     if not with_density:
         del callbacks["density"]
-    late = PlantSplats("quats", 9)  # after the search at the end of the prune phase
-    _, module = run([*callbacks.values(), late], max_steps=20)
+    # After the search at the end of the prune phase, and before the form of the covariances is chosen.
+    late = [PlantSplats("quats", 9), CanonicalCovariance()]
+    _, module = run([*callbacks.values(), *late], max_steps=20)
     assert module.schedule.first_of(Phase.QUANTIZE) == 10
     assert drops(caplog, "quats") == ["step 9: dropped 20"]
     assert 10 < module.history[-1]["psnr"] < 100
