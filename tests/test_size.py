@@ -16,8 +16,8 @@ ROOT = PACKAGE.parent
 # To be lowered with what the code loses. What a reader has to hold are the tokens: what a feature adds above the limit,
 # it has to remove. Lines are there to breathe, so tokens a line have a limit, too.
 LIMITS = {
-    "tokens": 200_000,
-    "tokens a line": 12.9,
+    "tokens": 195_000,
+    "tokens a line": 12.0,
     "code lines": 18_500,
     "files": 165,
     "files under 60 lines": 25,
@@ -26,7 +26,7 @@ LIMITS = {
     "lines of the longest config": 25,
     "commands, per cent of the code": 17,
     "files of callbacks": 15,
-    "methods of the largest class": 33,
+    "methods of the largest class": 22,
 }
 NO_CODE = {
     *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER),
