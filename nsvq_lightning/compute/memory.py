@@ -3,9 +3,9 @@
 import ctypes
 import gc
 import math
-import sys
 import threading
-from bisect import bisect_left
+import weakref
+from bisect import bisect_right
 from contextlib import suppress
 from typing import Any
 
@@ -17,8 +17,8 @@ Array = np.ndarray[Any, np.dtype[Any]]
 
 FLOAT32, INT32, INT64, UINT8, UINT64 = map(np.dtype, (np.float32, np.int32, np.int64, np.uint8, np.uint64))
 
-# Memory that is free, by size.
-_BUFFERS: list[Array] = []
+# Memory that is free.
+_FREE: list[Array] = []
 
 
 def flat(tensor: Tensor) -> Array:
@@ -118,24 +118,9 @@ _SLACK = 4
 _PAGE = 1024
 
 
-def _references(index: int) -> int:
-    return sys.getrefcount(_BUFFERS[index])
-
-
-# What is counted where only the list refers to a buffer: one less from Python 3.14 on, which counts no borrowed ones.
-_BUFFERS.append(np.empty(0, np.float32))
-_IDLE_REFERENCES = _references(0)
-_BUFFERS.clear()
-
-
-def _is_idle(index: int) -> bool:
-    """Whether only the list refers to a buffer."""
-    return _references(index) == _IDLE_REFERENCES
-
-
-def _place(size: float) -> int:
-    """Where the buffers of at least this size begin."""
-    return bisect_left(_BUFFERS, size, key=len)
+def _count_free(size: float) -> int:
+    """How many free buffers, sorted from the largest on, have at least this size."""
+    return bisect_right(_FREE, -size, key=lambda buffer: -len(buffer))
 
 
 def recycled(shape: tuple[int, ...]) -> Tensor:
@@ -146,18 +131,18 @@ def recycled(shape: tuple[int, ...]) -> Tensor:
     """
     size = math.prod(shape)
     with _LOCK:
-        fitting = range(_place(size), _place(_SLACK * size + _PAGE + 1))
-        smallest = next(filter(_is_idle, fitting), None)
-        if smallest is None:
+        # Tensors that end meanwhile, in whatever thread, append their memory, which is sorted in next time.
+        _FREE.sort(key=len, reverse=True)
+        large_enough = _count_free(size)
+        if large_enough > _count_free(_SLACK * size + _PAGE + 1):
+            buffer = _FREE.pop(large_enough - 1)  # the smallest, and of equal ones that which is still in the caches
+        else:
             # The number of splats grows: a buffer that is a little too small now will not be requested again.
-            for outgrown in filter(_is_idle, reversed(range(_place(size / 2), _place(size)))):
-                del _BUFFERS[outgrown]
-            new = torch.empty(size + size // 8 + _PAGE, dtype=torch.float32).numpy()
-            smallest = _place(new.size)
-            _BUFFERS.insert(smallest, new)
-            del new
-        # The tensor keeps the view alive, the view its buffer.
-        return torch.from_numpy(_BUFFERS[smallest][:size].reshape(shape))
+            del _FREE[large_enough : _count_free(size / 2)]
+            buffer = torch.empty(size + size // 8 + _PAGE, dtype=torch.float32).numpy()
+    view = buffer[:size].reshape(shape)  # which the tensor keeps alive
+    weakref.finalize(view, _FREE.append, buffer)
+    return torch.from_numpy(view)
 
 
 def check_tensor(

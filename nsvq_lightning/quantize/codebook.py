@@ -7,7 +7,7 @@ from typing import Any, Literal, Protocol, cast
 import torch
 from torch import Tensor, nn
 
-from nsvq_lightning.quantize.kmeans import draw_far_rows, kmeans, lookup, sum_by_code
+from nsvq_lightning.quantize.kmeans import draw_far_rows, kmeans, lookup, mean_by_code
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.tracking import NearestTracker
 from nsvq_lightning.random import generator as seeded
@@ -258,11 +258,8 @@ class CodebookQuantizer(nn.Module, ABC):
         finite = self.codebook[torch.isfinite(self.codebook).all(1)]
         self.codebook[broken] = copy_codes(finite, len(broken), generator)
         if self.frozen:
-            codes = self._frozen_codes(len(rows), None)
-            sums = sum_by_code(rows, codes, self.num_codes, torch.float64)
-            counts = torch.bincount(codes, minlength=self.num_codes)
-            owned = broken[counts[broken] > 0]
-            self.codebook[owned] = (sums[owned] / counts[owned, None]).to(self.codebook)
+            means = mean_by_code(rows, self._frozen_codes(len(rows), None), self.codebook)
+            self.codebook[broken] = means[broken]
         self._tracker.forget()
 
     def freeze(self, codes: Tensor) -> None:

@@ -136,7 +136,7 @@ def kmeans(
         start = rows_far_apart(x[first], k, generator) if spread else x[first][_shuffled(len(first), x, generator)[:k]]
     centroids = start.detach().clone()
     for _ in range(steps):
-        centroids = _lloyd_step(x, centroids, weight)
+        centroids = mean_by_code(x, nearest(x, centroids), centroids, weight)
     return centroids
 
 
@@ -145,10 +145,9 @@ def _shuffled(count: int, like: Tensor, generator: torch.Generator) -> Tensor:
     return torch.randperm(count, generator=generator, device=generator.device).to(like.device)
 
 
-def _lloyd_step(x: Tensor, centroids: Tensor, weight: Tensor | None) -> Tensor:
-    """Mean of the rows nearest to each centroid; a centroid without rows stays."""
-    codes = nearest(x, centroids)
-    k = len(centroids)
+def mean_by_code(x: Tensor, codes: Tensor, codebook: Tensor, weight: Tensor | None = None) -> Tensor:
+    """Mean of the rows ``x [N, D]`` of each code, taken in float64; a code without rows stays as in ``codebook``."""
+    k = len(codebook)
     if weight is None:
         sums = sum_by_code(x, codes, k, torch.float64)
         mass = torch.bincount(codes, minlength=k).double()
@@ -156,7 +155,7 @@ def _lloyd_step(x: Tensor, centroids: Tensor, weight: Tensor | None) -> Tensor:
         sums = sum_by_code(x * weight[:, None], codes, k)
         mass = sum_by_code(weight[:, None], codes, k)[:, 0]
     means = sums / mass.clamp_min(torch.finfo(torch.float64).tiny)[:, None]
-    return torch.where(mass[:, None] > 0, means.to(centroids.dtype), centroids)
+    return torch.where(mass[:, None] > 0, means.to(codebook.dtype), codebook)
 
 
 def distinct_rows(x: Tensor) -> Tensor:

@@ -46,8 +46,8 @@ _COS, _SIN = (tuple(F(value) for value in each) for each in (COS, SIN))
 
 
 @inline
-def _uniforms(seed, pair, radius, angle):
-    """Sixteen pairs starting at ``pair``: radius in (0, 1], angle in [-1/2, 1/2) turns, 24 random bits each."""
+def _uniforms(seed, pair, out, at):
+    """Sixteen pairs starting at ``pair``: radii in (0, 1], then angles in [-1/2, 1/2) turns, 24 random bits each."""
     key = np.uint64(seed)
     second_key = (key ^ (key >> np.uint64(31))) * _SECOND
     for lane in range(16):
@@ -55,22 +55,20 @@ def _uniforms(seed, pair, radius, angle):
         bits = (bits ^ (bits >> np.uint64(30))) * _FIRST
         bits = (bits ^ (bits >> np.uint64(27)) ^ second_key) * _SECOND
         bits = bits ^ (bits >> np.uint64(31))
-        radius[lane] = F(np.int32(bits >> np.uint64(40)) + np.int32(1)) * _UNIT
-        angle[lane] = F(np.int32(bits & np.uint64(0xFFFFFF))) * _UNIT - F(0.5)
+        simd.put(out, at + lane, F(np.int32(bits >> np.uint64(40)) + np.int32(1)) * _UNIT)
+        simd.put(out, at + 16 + lane, F(np.int32(bits & np.uint64(0xFFFFFF))) * _UNIT - F(0.5))
 
 
 @inline
-def fill_normal(seed, first, count, out, radius, angle):
-    """Write vectors ``first`` to ``first + count`` (both even) of a seed to ``out [count · 16]``.
-
-    ``radius`` and ``angle`` are scratch, ``[16]`` each.
-    """
+def fill_normal(seed, first, count, out):
+    """Write vectors ``first`` to ``first + count`` (both even) of a seed to ``out [count · 16]``."""
     for pair in range(count // 2):
-        _uniforms(seed, (first // 2 + pair) * 16, radius, angle)
-        length = simd.sqrt(simd.log2(simd.load(radius, 0)) * _MINUS_TWO_LN2)
-        turn = simd.load(angle, 0)
-        simd.store(out, pair * 32, length * _polynomial(_COS, turn * turn))
-        simd.store(out, pair * 32 + 16, length * (turn * _polynomial(_SIN, turn * turn)))
+        at = pair * 32
+        _uniforms(seed, (first // 2 + pair) * 16, out, at)
+        length = simd.sqrt(simd.log2(simd.load(out, at)) * _MINUS_TWO_LN2)
+        turn = simd.load(out, at + 16)
+        simd.store(out, at, length * _polynomial(_COS, turn * turn))
+        simd.store(out, at + 16, length * (turn * _polynomial(_SIN, turn * turn)))
 
 
 @inline
@@ -101,9 +99,8 @@ def _inverse(squared):
 @inline
 def _short_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, stop):
     noise = np.empty(_ROWS * dim, np.float32)
-    radius, angle = np.empty(16, np.float32), np.empty(16, np.float32)
     values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
-    fill_normal(seed, begin // 16 * dim, _ROWS // 16 * dim, noise, radius, angle)
+    fill_normal(seed, begin // 16 * dim, _ROWS // 16 * dim, noise)
     for first in range(begin, stop, 16):
         valid = min(16, stop - first)
         for lane in range(valid):
@@ -129,12 +126,11 @@ def _short_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin,
 def _long_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, stop):
     vectors = (dim + 15) // 16
     keep = new_lanes(dim)
-    radius, angle = np.empty(16, np.float32), np.empty(16, np.float32)
     noise, direction = np.empty(2 * vectors * 16, np.float32), np.empty(vectors * 16, np.float32)
     for i in range(begin, stop):
         start = i % 2 * vectors * 16
         if start == 0:
-            fill_normal(seed, i * vectors, 2 * vectors, noise, radius, angle)
+            fill_normal(seed, i * vectors, 2 * vectors, noise)
         at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
         error, squared = simd.broadcast(0), simd.broadcast(0)
         for j in range(vectors):

@@ -108,8 +108,8 @@ def test_results_are_a_function_of_the_generator_whatever_the_threads(aim: float
 
 def normal_values(seed: int, vectors: int) -> np.ndarray[Any, Any]:
     """The first values of a seed, as the kernels draw them."""
-    out, radius, angle = (np.empty(16 * count, np.float32) for count in (vectors, 1, 1))
-    numba.njit(lambda *scratch: fill_normal(seed, 0, vectors, *scratch))(out, radius, angle)
+    out = np.empty(16 * vectors, np.float32)
+    numba.njit(lambda out: fill_normal(seed, 0, vectors, out))(out)
     return out
 
 
