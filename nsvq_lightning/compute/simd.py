@@ -109,6 +109,9 @@ def _opened(context, builder, kind, value):
 # ------------------------------------------------------------------------------------------
 
 
+_add = functools.partial(ir.IRBuilder.fadd, flags=_CONTRACT)
+
+
 def _constant(value):
     return ir.Constant(_VF, [float(np.float32(value))] * WIDTH)
 
@@ -146,6 +149,10 @@ def _fused(builder, x, y, z):
     return _llvm(builder, "fmuladd.v16f32", [x, y, z])
 
 
+def _smaller(builder, x, y):
+    return builder.select(builder.fcmp_ordered("<", x, y), x, y)
+
+
 def _read(builder, address, count=WIDTH):
     return builder.load(builder.bitcast(address, ir.VectorType(_f32, count).as_pointer()), align=4)
 
@@ -158,27 +165,23 @@ def _write(builder, address, value):
 # --------------------------------------------------------------------------------------------------------
 
 
-def _flagged(name):
-    return lambda builder, x, y: getattr(builder, name)(x, y, flags=_CONTRACT)
-
-
 def _compared(symbol):
     return lambda builder, x, y: builder.fcmp_ordered(symbol, x, y)
 
 
 _TWO = (Lanes, Lanes)
-_operator(operator.add, Lanes, _TWO, _flagged("fadd"))
-_operator(operator.sub, Lanes, _TWO, _flagged("fsub"))
-_operator(operator.mul, Lanes, _TWO, _flagged("fmul"))
-_operator(operator.truediv, Lanes, _TWO, lambda builder, x, y: builder.fdiv(x, y))
-_operator(operator.neg, Lanes, (Lanes,), lambda builder, x: builder.fneg(x))
+_operator(operator.add, Lanes, _TWO, _add)
+_operator(operator.sub, Lanes, _TWO, functools.partial(ir.IRBuilder.fsub, flags=_CONTRACT))
+_operator(operator.mul, Lanes, _TWO, functools.partial(ir.IRBuilder.fmul, flags=_CONTRACT))
+_operator(operator.truediv, Lanes, _TWO, ir.IRBuilder.fdiv)
+_operator(operator.neg, Lanes, (Lanes,), ir.IRBuilder.fneg)
 _operator(operator.ge, Mask, _TWO, _compared(">="))
 _operator(operator.le, Mask, _TWO, _compared("<="))
 _operator(operator.lt, Mask, _TWO, _compared("<"))
 _operator(operator.gt, Mask, _TWO, _compared(">"))
-_operator(operator.and_, Mask, (Mask, Mask), lambda builder, x, y: builder.and_(x, y))
-_operator(operator.or_, Mask, (Mask, Mask), lambda builder, x, y: builder.or_(x, y))
-_operator(operator.invert, Mask, (Mask,), lambda builder, x: builder.not_(x))
+_operator(operator.and_, Mask, (Mask, Mask), ir.IRBuilder.and_)
+_operator(operator.or_, Mask, (Mask, Mask), ir.IRBuilder.or_)
+_operator(operator.invert, Mask, (Mask,), ir.IRBuilder.not_)
 
 # ---- memory
 # -----------------------------------------------------------------------------------------------------------
@@ -252,7 +255,7 @@ def fnma(builder, x, y, z):
 @_function(Lanes, Lanes, Lanes)
 def minimum(builder, x, y):
     """The smaller of two; the second one where the first is NaN."""
-    return builder.select(builder.fcmp_ordered("<", x, y), x, y)
+    return _smaller(builder, x, y)
 
 
 @_function(Lanes, Lanes, Lanes)
@@ -355,20 +358,20 @@ def _folded(builder, value, combine):
     """The 16 lanes combined to a scalar, always in the same order."""
     for step in (8, 4, 2, 1):
         rotated = _shuffle(builder, value, value, [(lane + step) % WIDTH for lane in range(WIDTH)])
-        value = combine(value, rotated)
+        value = combine(builder, value, rotated)
     return builder.extract_element(value, _i32(0))
 
 
 @_function(types.float32, Lanes)
 def lane_sum(builder, lanes):
     """Sum of the 16 lanes, always in the same order."""
-    return _folded(builder, lanes, lambda x, y: builder.fadd(x, y, flags=_CONTRACT))
+    return _folded(builder, lanes, _add)
 
 
 @_function(types.float32, Lanes)
 def lane_min(builder, lanes):
     """Smallest of the 16 lanes; a NaN lane may be passed over or returned."""
-    return _folded(builder, lanes, lambda x, y: builder.select(builder.fcmp_ordered("<", y, x), y, x))
+    return _folded(builder, lanes, lambda builder, x, y: _smaller(builder, y, x))
 
 
 @_function(Lanes, types.UniTuple)
@@ -383,7 +386,7 @@ def lane_sums(builder, vectors):
         merged = []
         for first, second in zip(vectors[0::2], vectors[1::2], strict=True):
             own, other = builder.select(kept, second, first), _shuffle(builder, first, second, moved)
-            merged.append(builder.fadd(own, other, flags=_CONTRACT))
+            merged.append(_add(builder, own, other))
         vectors = merged
     return vectors[0]
 

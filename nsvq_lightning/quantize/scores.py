@@ -24,39 +24,26 @@ _GROUP = 6  # rows scored together
 _TILE = 8 * _GROUP  # rows that pass over a chunk of codes while it stays in the L1 cache
 
 
-@parallel
-def _lay_out(block, _, codebook, centre, blocks, halves):
-    """Write blocks of centred codes and half their squared norms; a non-finite code becomes 0 with an infinite norm."""
-    count, dim = codebook.shape
-    for lane in range(32):
-        code, total = block * 32 + lane, np.float64(np.inf)
-        if code < count:
-            total = np.float64(0.0)
-            for j in range(dim):
-                value = codebook[code, j] - centre[j]
-                blocks[block, j, lane] = value
-                total += np.float64(value) * np.float64(value)
-        if total < np.inf:
-            halves[code] = 0.5 * total
-            continue
-        halves[code] = np.inf
-        for j in range(dim):
-            blocks[block, j, lane] = 0
-
-
 def _centred(codebook: Array) -> tuple[Array, Array, Array, np.float32]:
     """Mean of the finite codes ``[D]``, and what is centred on it.
 
     The codes in blocks of 32, ``[⌈K/32⌉, D, 32]`` flat; half their squared norms ``[⌈K/32⌉ · 32]``, infinite where
-    there is no finite code; and the largest norm.
+    there is no finite code, which is 0 there; and the largest norm.
     """
     count, dim = codebook.shape
     finite = np.isfinite(codebook).all(1)
     centre = (codebook[finite] if finite.any() else np.zeros((1, dim))).mean(0, dtype=np.float64).astype(np.float32)
-    blocks, halves = aligned_empty((-(-count // 32), dim, 32)), np.empty(-(-count // 32) * 32, np.float32)
-    _lay_out(len(blocks), codebook, centre, blocks, halves)
-    longest = float(halves[np.isfinite(halves)].max(initial=0.0))
-    return centre, blocks.ravel(), halves, F(np.sqrt(2.0 * longest))
+    codes = np.zeros((-(-count // 32) * 32, dim), np.float32)
+    with np.errstate(over="ignore"):
+        codes[:count] = codebook - centre
+        halves = (np.einsum("ij,ij->i", codes, codes, dtype=np.float64) / 2).astype(np.float32)
+    lost = ~np.isfinite(halves)
+    lost[count:] = True
+    codes[lost] = 0
+    halves[lost] = np.inf
+    blocks = aligned_empty((len(codes) // 32, dim, 32))
+    blocks[:] = codes.reshape(-1, 32, dim).transpose(0, 2, 1)
+    return centre, blocks.ravel(), halves, F(np.sqrt(2 * float(halves[~lost].max(initial=0))))
 
 
 @inline

@@ -143,7 +143,7 @@ class NearestTracker:
             from nsvq_lightning.quantize.cuda.search import DeviceTracker
 
             if self._on_device is None or not self._on_device.fits(codebook):
-                self._on_device = DeviceTracker(len(codebook), codebook.shape[1], codebook.device)
+                self._on_device = DeviceTracker(codebook)
             codes: Tensor = self._on_device.search(x, codebook, chosen)
             return codes
         numbers = chosen.numpy()

@@ -96,7 +96,7 @@ def test_codes_that_a_bound_proves_are_those_of_a_search(
 ) -> None:
     monkeypatch.setattr(search_module, "PROGRAMS", programs)  # one works off the whole queue
     monkeypatch.setattr(search_module, "SNAPSHOT_STEPS", 4)
-    tracker = DeviceTracker(150, dim, torch.device(DEVICE))
+    tracker = DeviceTracker(next(walk(dim, 1, size))[1].to(DEVICE))
     for x, codebook, rows in walk(dim, 9 if size < 1e-2 else 5, size):
         found = tracker.search(x.to(DEVICE), codebook.to(DEVICE), rows.to(DEVICE))
         assert torch.equal(found.cpu(), nearest(x[rows], codebook))
@@ -106,7 +106,7 @@ def test_codes_that_a_bound_proves_are_those_of_a_search(
 
 
 def test_a_jump_of_codes_is_paid_for_once_on_the_device(searched: list[int]) -> None:
-    tracker, everything = DeviceTracker(150, 9, torch.device(DEVICE)), torch.arange(60)
+    tracker, everything = DeviceTracker(next(walk(9, 1, 1e-4))[1].to(DEVICE)), torch.arange(60)
     for step, (x, codebook, _) in enumerate(walk(9, 8, 1e-4)):
         if step >= 3:
             codebook = torch.where(torch.arange(150)[:, None] % 10 == 0, codebook + 1.0, codebook)
@@ -117,7 +117,7 @@ def test_a_jump_of_codes_is_paid_for_once_on_the_device(searched: list[int]) -> 
 
 
 def test_equal_codes_and_numbers_that_are_none_on_the_device() -> None:
-    tracker, everything = DeviceTracker(150, 9, torch.device(DEVICE)), torch.arange(60)
+    tracker, everything = DeviceTracker(next(walk(9, 1, 1e-4))[1].to(DEVICE)), torch.arange(60)
     for x, codebook, _ in walk(9, 4, 1e-4):
         codebook[75:] = codebook[:75]
         codebook[3, 4], x[5] = torch.nan, torch.nan
@@ -126,7 +126,7 @@ def test_equal_codes_and_numbers_that_are_none_on_the_device() -> None:
 
 
 def test_few_codes_and_more_rows_on_the_device() -> None:
-    tracker = DeviceTracker(3, 4, torch.device(DEVICE))
+    tracker = DeviceTracker(rows_and_codes(5, 3, 4, seed=1)[1].to(DEVICE))
     for count in (5, 9, 2, 0, 7):
         x, codebook = rows_and_codes(count, 3, 4, seed=1)
         found = tracker.search(x.to(DEVICE), codebook.to(DEVICE), torch.arange(count, device=DEVICE))

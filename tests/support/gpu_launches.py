@@ -82,7 +82,7 @@ def loss(height: int, dtype: torch.dtype) -> None:
 
 
 def search(dim: int) -> None:
-    tracker = DeviceTracker(4096, dim, torch.device("meta"))
+    tracker = DeviceTracker(tensor(4096, dim))
     for _ in range(SNAPSHOT_STEPS):  # the last one takes a snapshot
         tracker.search(tensor(SPLATS, dim), tensor(4096, dim), tensor(SEEN, dtype=torch.int64))
 

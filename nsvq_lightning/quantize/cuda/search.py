@@ -13,8 +13,6 @@ of :mod:`nsvq_lightning.quantize.tracking`; here rows of any dimension have a li
 be searched is known to the GPU alone: it queues them and works the queue off, and the host reads nothing back.
 """
 
-from typing import Any
-
 import torch
 import triton
 import triton.language as tl
@@ -25,17 +23,16 @@ from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quantize.box_search import ROUNDING
 from nsvq_lightning.quantize.scores import LIST
 
-ROWS = 8  # rows per program of a search
-CODES = 128  # codes that it compares its rows with at a time
-BLOCK = 64  # rows, or codes, per program of a check
+ROWS = tl.constexpr(8)  # rows per program of a search
+CODES = tl.constexpr(128)  # codes that it compares its rows with at a time
+BLOCK = tl.constexpr(64)  # rows, or codes, per program of a check
+COPIED = tl.constexpr(1024)  # numbers per program of a copy
+MEMBERS = tl.constexpr(LIST)
 SLACK = tl.constexpr(ROUNDING)
 
 
 @triton.jit
-def compare(
-    x, at, codebook, num_codes, code_stride, DIM: tl.constexpr, ROWS: tl.constexpr, CODES: tl.constexpr,
-    WITH_SECOND: tl.constexpr,
-):  # fmt: skip
+def compare(x, at, codebook, num_codes, code_stride, DIM: tl.constexpr, WITH_SECOND: tl.constexpr):
     """Compare rows with all codes ``[DIM, code_stride]``, which are infinite beyond ``num_codes``.
 
     Each column stands for every ``CODES``-th code. Returns their smallest distance to each row ``[ROWS, CODES]``, the
@@ -70,18 +67,15 @@ def least_of(smallest, chosen, num_codes):
 
 
 @triton.jit(do_not_specialize=["count"])
-def nearest_kernel(
-    x, codebook, result, count, num_codes, code_stride, DIM: tl.constexpr, ROWS: tl.constexpr, CODES: tl.constexpr,
-):  # fmt: skip
+def nearest_kernel(x, codebook, result, count, num_codes, code_stride, DIM: tl.constexpr):
     """Nearest code of each row ``[count, DIM]``."""
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     at = tl.minimum(row, tl.cast(count, tl.int64) - 1) * DIM
-    smallest, chosen, _ = compare(x, at, codebook, num_codes, code_stride, DIM, ROWS, CODES, False)
+    smallest, chosen, _ = compare(x, at, codebook, num_codes, code_stride, DIM, False)
     _, nearest = least_of(smallest, chosen, num_codes)
     tl.store(result + row, nearest.to(tl.int64), mask=row < count)
 
 
-COPIED = 1024  # numbers per program of a copy
 PROGRAMS = 4096  # most programs of a search; they share the queue, whatever its length
 SNAPSHOT_STEPS = 16  # searches between two snapshots, as on the CPU
 
@@ -103,17 +97,16 @@ def nearest_codes(x: Tensor, codebook: Tensor) -> Tensor:
     if len(x):
         codes = by_column(codebook)
         with torch.cuda.device_of(x):
-            nearest_kernel[(triton.cdiv(len(x), ROWS),)](
-                x, codes, result, len(x), len(codebook), codes.shape[1], DIM=x.shape[1], ROWS=ROWS, CODES=CODES,
-                num_warps=1, **COMPILE,
-            )  # fmt: skip
+            nearest_kernel[(triton.cdiv(len(x), ROWS.value),)](
+                x, codes, result, len(x), len(codebook), codes.shape[1], DIM=x.shape[1], num_warps=1, **COMPILE
+            )
     return result
 
 
 def by_column(codebook: Tensor) -> Tensor:
     """Codes ``[K, D]`` transposed to ``[D, M]``, K rounded up to whole tiles; infinite where there is no code."""
     count, dim = codebook.shape
-    columns = codebook.new_full((dim, triton.cdiv(count, CODES) * CODES), torch.inf)
+    columns = codebook.new_full((dim, triton.cdiv(count, CODES.value) * CODES.value), torch.inf)
     columns[:, :count] = codebook.t()
     return columns
 
@@ -147,7 +140,7 @@ def bound_below(squared):
 
 
 @triton.jit
-def drift_kernel(codebook, snapshot, squared_drift, num_codes, DIM: tl.constexpr, BLOCK: tl.constexpr):
+def drift_kernel(codebook, snapshot, squared_drift, num_codes, DIM: tl.constexpr):
     """Raise ``squared_drift[0]``, the bits of a float32, to how far any of the codes has moved since the snapshot."""
     code = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = code < num_codes
@@ -174,19 +167,19 @@ def have_jumped(ends, count):
 
 
 @triton.jit(do_not_specialize=["count"])
-def snapshot_kernel(codebook, snapshot, travelled, squared_drift, ends, count, size, BLOCK: tl.constexpr):
+def snapshot_kernel(codebook, snapshot, travelled, squared_drift, ends, count, size):
     """Take a snapshot of the codes, if they have jumped."""
     if have_jumped(ends, count):
-        place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+        place = tl.program_id(0) * COPIED + tl.arange(0, COPIED)
         tl.store(snapshot + place, tl.load(codebook + place, mask=place < size, other=0.0), mask=place < size)
         if tl.program_id(0) == 0:
             tl.store(travelled, tl.load(travelled) + drift_of(squared_drift))
 
 
 @triton.jit(do_not_specialize=["count"])
-def queue_kernel(ends, queue, count, BLOCK: tl.constexpr):
+def queue_kernel(ends, queue, count):
     """Line up the places at which the running sum ``ends`` rises."""
-    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    place = tl.program_id(0).to(tl.int64) * COPIED + tl.arange(0, COPIED)
     end = tl.load(ends + place, mask=place < count, other=0)
     before = tl.load(ends + place - 1, mask=(place < count) & (place > 0), other=0)
     tl.store(queue + before, place.to(tl.int32), mask=end > before)
@@ -195,7 +188,7 @@ def queue_kernel(ends, queue, count, BLOCK: tl.constexpr):
 @triton.jit(do_not_specialize=["count"])
 def check_kernel(
     x, rows, codebook, last, lists, anchors, clearance, limits, travelled, squared_drift, result, searched, count,
-    DIM: tl.constexpr, BLOCK: tl.constexpr, LIST: tl.constexpr,
+    DIM: tl.constexpr,
 ):  # fmt: skip
     """Codes of the rows for which a bound proves one; 1 in ``searched`` for the others.
 
@@ -220,9 +213,9 @@ def check_kernel(
     proven = known & (bound(squared) + moved < tl.load(clearance + row, mask=known, other=0.0) - way)
     open_ = known & ~proven
     if tl.max(open_.to(tl.int32), 0) > 0:
-        member = tl.arange(0, LIST)
-        listed = tl.load(lists + row[:, None] * LIST + member[None, :], mask=open_[:, None], other=0)
-        distances = tl.zeros([BLOCK, LIST], tl.float32)
+        member = tl.arange(0, MEMBERS)
+        listed = tl.load(lists + row[:, None] * MEMBERS + member[None, :], mask=open_[:, None], other=0)
+        distances = tl.zeros([BLOCK, MEMBERS], tl.float32)
         for j in range(DIM):
             value = tl.load(x + row * DIM + j, mask=open_, other=0.0)
             away = tl.load(codebook + listed.to(tl.int64) * DIM + j, mask=open_[:, None], other=0.0) - value[:, None]
@@ -249,7 +242,7 @@ def check_kernel(
 @triton.jit(do_not_specialize=["count"])
 def search_kernel(
     x, rows, queue, ends, codebook, last, lists, anchors, clearance, limits, travelled, squared_drift, result, count,
-    num_codes, code_stride, DIM: tl.constexpr, ROWS: tl.constexpr, CODES: tl.constexpr, LIST: tl.constexpr,
+    num_codes, code_stride, DIM: tl.constexpr,
 ):  # fmt: skip
     """Search the rows in the queue and remember what was found; ``ends[count - 1]`` is its length."""
     length = tl.load(ends + count - 1)
@@ -261,17 +254,17 @@ def search_kernel(
         inside = turn < length
         place = tl.load(queue + tl.minimum(turn, length - 1))
         row = tl.load(rows + place)
-        smallest, chosen, second = compare(x, row * DIM, codebook, num_codes, code_stride, DIM, ROWS, CODES, True)
+        smallest, chosen, second = compare(x, row * DIM, codebook, num_codes, code_stride, DIM, True)
         least, nearest = least_of(smallest, chosen, num_codes)
         tl.store(result + place, nearest.to(tl.int64), mask=inside)
         tl.store(last + row, nearest, mask=inside)
         # A column's second code is outside the list whatever happens, and bounds it.
         outside = tl.min(second, 1)
-        for member in tl.static_range(LIST):
+        for member in tl.static_range(MEMBERS):
             least, code = least_of(smallest, chosen, num_codes)
             if member == 1:
                 tl.store(clearance + row, bound_below(tl.minimum(least, outside)) + before, mask=inside)
-            tl.store(lists + row * LIST + member, code, mask=inside)
+            tl.store(lists + row * MEMBERS + member, code, mask=inside)
             smallest = tl.where(chosen == code[:, None], float("inf"), smallest)
         far = tl.minimum(tl.min(smallest, 1), outside)
         tl.store(limits + row, bound_below(far) + before, mask=inside)
@@ -285,17 +278,16 @@ class DeviceTracker:
     What it remembers takes memory (52 bytes per row and 4 per column of it) but never changes a result.
     """
 
-    def __init__(self, num_codes: int, dim: int, device: torch.device) -> None:
-        self.num_codes, self.dim, self.device = num_codes, dim, device
-        self._memory = empty_memory(0, dim, device)
+    def __init__(self, codebook: Tensor) -> None:
+        self._snapshot = codebook.clone()
+        self._memory = empty_memory(0, codebook.shape[1], codebook.device)
         self._steps = 0
-        self._snapshot: Any = None  # until the first search
-        self._travelled = torch.zeros(1, dtype=torch.float64, device=device)
-        self._squared_drift = torch.zeros(1, dtype=torch.int32, device=device)
+        self._travelled = torch.zeros(1, dtype=torch.float64, device=codebook.device)
+        self._squared_drift = torch.zeros(1, dtype=torch.int32, device=codebook.device)
 
     def fits(self, codebook: Tensor) -> bool:
         """Whether it remembers searches of as many codes, on this device."""
-        return codebook.shape == (self.num_codes, self.dim) and codebook.device == self.device
+        return codebook.shape == self._snapshot.shape and codebook.device == self._snapshot.device
 
     def search(self, x: Tensor, codebook: Tensor, rows: Tensor) -> Tensor:
         """Nearest codes ``[V]`` int64.
@@ -309,29 +301,30 @@ class DeviceTracker:
             ValueError: The tensors do not fit together.
             TypeError: A dtype is wrong.
         """
-        check_tensor("x", x, (len(x), self.dim), self.device)
-        check_tensor("codebook", codebook, (self.num_codes, self.dim), self.device)
-        check_tensor("rows", rows, (len(rows),), self.device, torch.int64)
+        (num_codes, dim), device = self._snapshot.shape, self._snapshot.device
+        check_tensor("x", x, (len(x), dim), device)
+        check_tensor("codebook", codebook, (num_codes, dim), device)
+        check_tensor("rows", rows, (len(rows),), device, torch.int64)
         count = len(rows)
-        result = torch.empty(count, dtype=torch.int64, device=self.device)
-        self._grow(len(x))
-        if self._snapshot is None:
-            self._snapshot = codebook.clone()
+        result = torch.empty_like(rows)
+        more = len(x) - len(self._memory[0])
+        if more > 0:
+            both = zip(self._memory, empty_memory(more, dim, device), strict=True)
+            self._memory = tuple(map(torch.cat, both))
         if count == 0:
             return result
-        searched, queue = torch.empty(2, count, dtype=torch.int32, device=self.device)
+        searched, queue = torch.empty(2, count, dtype=torch.int32, device=device)
         travel, codes = (self._travelled, self._squared_drift), by_column(codebook)
         with torch.cuda.device_of(x):
             self._follow(codebook)
-            check_kernel[(triton.cdiv(count, BLOCK),)](
-                x, rows, codebook, *self._memory, *travel, result, searched, count, DIM=self.dim, BLOCK=BLOCK,
-                LIST=LIST, **COMPILE,
-            )  # fmt: skip
+            check_kernel[(triton.cdiv(count, BLOCK.value),)](
+                x, rows, codebook, *self._memory, *travel, result, searched, count, DIM=dim, **COMPILE
+            )
             ends = searched.cumsum(0, dtype=torch.int32)
-            queue_kernel[(triton.cdiv(count, COPIED),)](ends, queue, count, BLOCK=COPIED, **COMPILE)
-            search_kernel[(min(PROGRAMS, triton.cdiv(count, ROWS)),)](
-                x, rows, queue, ends, codes, *self._memory, *travel, result, count, self.num_codes, codes.shape[1],
-                DIM=self.dim, ROWS=ROWS, CODES=CODES, LIST=LIST, num_warps=1, **COMPILE,
+            queue_kernel[(triton.cdiv(count, COPIED.value),)](ends, queue, count, **COMPILE)
+            search_kernel[(min(PROGRAMS, triton.cdiv(count, ROWS.value)),)](
+                x, rows, queue, ends, codes, *self._memory, *travel, result, count, num_codes, codes.shape[1],
+                DIM=dim, num_warps=1, **COMPILE,
             )  # fmt: skip
             self._follow_jump(codebook, ends, count)
         return result
@@ -340,8 +333,9 @@ class DeviceTracker:
         """Note how far codes have moved since the snapshot; now and then, take a new one."""
         self._steps += 1
         self._squared_drift.zero_()
-        drift_kernel[(triton.cdiv(self.num_codes, BLOCK),)](
-            codebook, self._snapshot, self._squared_drift, self.num_codes, DIM=self.dim, BLOCK=BLOCK, **COMPILE
+        num_codes, dim = codebook.shape
+        drift_kernel[(triton.cdiv(num_codes, BLOCK.value),)](
+            codebook, self._snapshot, self._squared_drift, num_codes, DIM=dim, **COMPILE
         )
         if self._steps % SNAPSHOT_STEPS == 0:
             self._travelled += self._squared_drift.view(torch.float32).double().sqrt() * ROUNDING
@@ -351,13 +345,6 @@ class DeviceTracker:
     def _follow_jump(self, codebook: Tensor, ends: Tensor, count: int) -> None:
         """Take a snapshot if codes have jumped."""
         size = codebook.numel()
-        snapshot_kernel[(triton.cdiv(size, COPIED),)](
-            codebook, self._snapshot, self._travelled, self._squared_drift, ends, count, size, BLOCK=COPIED, **COMPILE
+        snapshot_kernel[(triton.cdiv(size, COPIED.value),)](
+            codebook, self._snapshot, self._travelled, self._squared_drift, ends, count, size, **COMPILE
         )
-
-    def _grow(self, count: int) -> None:
-        """Make room for ``count`` rows."""
-        more = count - len(self._memory[0])
-        if more > 0:
-            both = zip(self._memory, empty_memory(more, self.dim, self.device), strict=True)
-            self._memory = tuple(map(torch.cat, both))

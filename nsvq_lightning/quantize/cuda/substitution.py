@@ -22,9 +22,11 @@ TWO_LOG2_E = tl.constexpr(2 / math.log(2))
 ARTANH = tl.constexpr((1 / 11, 1 / 9, 1 / 7, 1 / 5, 1 / 3, 1.0))
 TINY = tl.constexpr(torch.finfo(torch.float32).tiny)
 
-ROWS = 16  # rows of a code that are added up side by side
-PARTS = 8  # most programs that share the rows of one code, so that one of very many is no long tail; a power of two
-PART = 256  # fewest rows of a part, but for the last one
+ROWS = tl.constexpr(16)  # rows of a code that are added up side by side
+PARTS = tl.constexpr(
+    8
+)  # most programs that share the rows of one code, so that one of very many is no long tail; a power of two
+PART = tl.constexpr(256)  # fewest rows of a part, but for the last one
 
 
 @triton.jit
@@ -205,22 +207,19 @@ def substitute_backward(
 
 
 @triton.jit
-def part_size(begin, end, PARTS: tl.constexpr, PART: tl.constexpr):
+def part_size(begin, end):
     """Rows in a part of a code's rows ``begin`` to ``end``."""
     return tl.maximum(tl.cdiv(end - begin, PARTS), PART)
 
 
 @triton.jit
-def part_kernel(
-    values, order, offsets, partial, dim, PARTS: tl.constexpr, PART: tl.constexpr, ROWS: tl.constexpr,
-    WIDTH: tl.constexpr,
-):  # fmt: skip
+def part_kernel(values, order, offsets, partial, dim, WIDTH: tl.constexpr):
     """Sum a part of a code's rows ``order[offsets[code]:offsets[code + 1]]`` in the dtype of ``partial``."""
     program = tl.program_id(0).to(tl.int64)
     code, part = program // PARTS, (program % PARTS).to(tl.int32)
     column = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)[None, :]
     begin, end = tl.load(offsets + code), tl.load(offsets + code + 1)
-    size = part_size(begin, end, PARTS, PART)
+    size = part_size(begin, end)
     first = begin + part * size
     last = tl.minimum(first + size, end)
     if first < last:
@@ -235,13 +234,13 @@ def part_kernel(
 
 
 @triton.jit
-def sum_kernel(partial, offsets, sums, dim, PARTS: tl.constexpr, PART: tl.constexpr, WIDTH: tl.constexpr):
+def sum_kernel(partial, offsets, sums, dim, WIDTH: tl.constexpr):
     """Sum the parts of a code; 0 for a code without rows."""
     code = tl.program_id(0).to(tl.int64)
     column = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)
     begin, end = tl.load(offsets + code), tl.load(offsets + code + 1)
     part = tl.arange(0, PARTS)[:, None]
-    there = (part * part_size(begin, end, PARTS, PART) < end - begin) & (column < dim)[None, :]
+    there = (part * part_size(begin, end) < end - begin) & (column < dim)[None, :]
     total = tl.load(partial + (code * PARTS + part) * dim + column[None, :], mask=there, other=0.0)
     tl.store(sums + code * dim + column, tl.sum(total, 0), mask=column < dim)
 
@@ -289,13 +288,11 @@ def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) 
     dim = values.shape[1]
     width = min(64, triton.next_power_of_2(dim))
     columns = triton.cdiv(dim, width)
-    partial = torch.empty(num_codes * PARTS, dim, dtype=dtype, device=values.device)
+    partial = torch.empty(num_codes * PARTS.value, dim, dtype=dtype, device=values.device)
     sums = torch.empty(num_codes, dim, dtype=dtype, device=values.device)
     with torch.cuda.device_of(values):
-        part_kernel[(num_codes * PARTS, columns)](
-            values, order, offsets, partial, dim, PARTS=PARTS, PART=PART, ROWS=ROWS, WIDTH=width, num_warps=1, **COMPILE
+        part_kernel[(num_codes * PARTS.value, columns)](
+            values, order, offsets, partial, dim, WIDTH=width, num_warps=1, **COMPILE
         )
-        sum_kernel[(num_codes, columns)](
-            partial, offsets, sums, dim, PARTS=PARTS, PART=PART, WIDTH=width, num_warps=1, **COMPILE
-        )
+        sum_kernel[(num_codes, columns)](partial, offsets, sums, dim, WIDTH=width, num_warps=1, **COMPILE)
     return sums
