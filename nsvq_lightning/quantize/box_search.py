@@ -6,13 +6,13 @@ exceeds the float32 distance of a code inside: pruning needs no safety margin, a
 all codes, bit for bit. The first candidate is the best code of the leaf that looks nearest; a bad one costs time but
 does not change the result.
 
-Most queries of a later step need no search: :class:`Memory` keeps where a query was last searched and how far the
+Most queries of a later step need no search: a memory keeps where a query was last searched and how far the
 second-nearest code was then. As long as the distance to its code and the distances that the query and the codes have
 moved add up to less, the code is still the nearest (:mod:`tracking`).
 """
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,34 +26,6 @@ ROUNDING = 1.0 + 1e-5
 _NO_CODE = np.int32(np.iinfo(np.int32).max)  # label of a lane without a code
 _ROWS = 512  # queries per unit of parallel work; a pass over them hides the latency of one behind the others
 _TASKS = 2048  # capacity for visits to leaves, which are deferred and processed together
-
-
-class Memory(NamedTuple):
-    """What is known about rows from their last search.
-
-    Attributes:
-        last: Code, or -1 for a row that has not been searched, ``[N]`` int32.
-        anchors: Where the row was then, ``[N, D]``.
-        clearance: Distance below which there was no other code, plus how far the codes had moved by then, ``[N]`` in
-            float64, because movements add up over a whole run.
-    """
-
-    last: Array
-    anchors: Array
-    clearance: Array
-
-    @classmethod
-    def empty(cls, dim: int) -> "Memory":
-        """Memory of no rows."""
-        return cls(np.empty(0, np.int32), np.empty((0, dim), np.float32), np.empty(0))
-
-    def grown(self, more: int) -> "Memory":
-        """With ``more`` rows that have not been searched."""
-        return Memory(
-            np.pad(self.last, (0, more), constant_values=-1),
-            np.pad(self.anchors, ((0, more), (0, 0))),
-            np.pad(self.clearance, (0, more), constant_values=-np.inf),
-        )
 
 
 # Beyond this dimension, boxes prune too little, and the scores of :mod:`scores` are faster.
@@ -377,7 +349,7 @@ def box_search(
     codebook: Array,
     order: Array | None = None,
     rows: Array | None = None,
-    memory: Memory | None = None,
+    memory: tuple[Array, ...] | None = None,
     travelled: float = 0.0,
 ) -> Array:
     """Nearest codes ``[V]`` of contiguous queries; one with a NaN gets code 0.
@@ -388,8 +360,10 @@ def box_search(
         order: From :func:`sort_into_leaves`. That of an earlier codebook saves the sorting, is correct in any case, and
             good while codes have moved little.
         rows: Which queries, ``[V]``, distinct; all of them by default.
-        memory: Results of earlier searches of these rows (it may have more), updated in place; without it every query
-            is searched.
+        memory: What is known of these rows (it may have more) from their last searches, updated in place: their codes
+            ``[N]`` int32, -1 before the first; where they were then ``[N, D]``; and the distances below which there was
+            no other code, plus how far the codes had moved by then, ``[N]`` in float64, because movements add up over a
+            whole run. Without it every query is searched.
         travelled: Upper bound on how far any code has moved in total since ``memory`` was empty.
 
     Raises:
@@ -402,13 +376,13 @@ def box_search(
     check_array("codebook", codebook, (num_codes, dim), x.dtype)
     order = sort_into_leaves(codebook) if order is None else order
     rows = np.arange(count) if rows is None else rows
-    remembered = 0 if memory is None else max(count, len(memory.last))
-    last, anchors, clearance = memory or Memory.empty(dim)
+    remembered = 0 if memory is None else max(count, len(memory[0]))
+    last, anchors, clearance = memory or (np.empty(0, np.int32), np.empty((0, dim), np.float32), np.empty(0))
     check_array("order", order, (num_codes,), INT32)
     check_array("rows", rows, (rows.size,), INT64)
-    check_array("memory.last", last, (remembered,), INT32)
-    check_array("memory.anchors", anchors, (remembered, dim), FLOAT32)
-    check_array("memory.clearance", clearance, (remembered,), np.dtype(np.float64))
+    check_array("memory[0]", last, (remembered,), INT32)
+    check_array("memory[1]", anchors, (remembered, dim), FLOAT32)
+    check_array("memory[2]", clearance, (remembered,), np.dtype(np.float64))
     if order.min() < 0 or order.max() >= num_codes:
         raise outside("order", order, num_codes)
     result = np.empty(len(rows), np.int64)

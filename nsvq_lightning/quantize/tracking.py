@@ -20,7 +20,7 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import INT64, Array, check_array
-from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, Memory, box_search, sort_into_leaves
+from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, box_search, sort_into_leaves
 from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, closer, new_lanes, score_search, squares
 
@@ -58,7 +58,7 @@ def _check_kernel(dim: int) -> Any:
     """The check for one dimension, a compile-time constant."""
 
     def check(block, _, x, rows, codebook, memory, travelled, drift, result):
-        last, lists, anchors, clearance, limits = memory
+        last, anchors, clearance, lists, limits = memory
         way, keep = travelled + drift, new_lanes(dim)
         unused, scratch = np.zeros(16, np.float32), np.empty(16, np.float32)
         unused[LIST:] = np.inf
@@ -95,6 +95,22 @@ def _check_kernel(dim: int) -> Any:
     return parallel(check)
 
 
+def _blank_memory(count: int, dim: int) -> tuple[Array, ...]:
+    """What is known about ``count`` rows that have not been searched.
+
+    The memory of :func:`box_search` and, in many dimensions, the codes that were near ``[N, LIST]`` int32, with the
+    distance below which there was none outside the list, plus how far the codes had moved by then, ``[N]``.
+    """
+    listed = count if dim > MAX_DIM else 0
+    return (
+        np.full(count, -1, np.int32),
+        np.zeros((count, dim), np.float32),
+        np.full(count, -np.inf),
+        np.zeros((listed, LIST), np.int32),
+        np.full(listed, -np.inf),
+    )
+
+
 class NearestTracker:
     """Nearest codes of the same rows, step after step.
 
@@ -112,8 +128,7 @@ class NearestTracker:
         self._order: Array | None = None
         self._snapshot = np.zeros((0, 0), np.float32)
         self._travelled = 0.0
-        self._memory = Memory.empty(0)
-        self._lists, self._limits = np.empty((0, LIST), np.int32), np.empty(0)
+        self._memory: tuple[Array, ...] = ()
 
     def search(self, x: Tensor, codebook: Tensor, rows: Tensor | None = None) -> Tensor:
         """Nearest codes, the result of :func:`nearest` for the chosen rows.
@@ -159,27 +174,25 @@ class NearestTracker:
         dim = codebook.shape[1]
         if self._snapshot.shape != codebook.shape:
             self.forget()
-            self._snapshot, self._memory = codebook.copy(), Memory.empty(dim)
-        more = count - len(self._memory.last)
+            self._snapshot, self._memory = codebook.copy(), _blank_memory(0, dim)
+        more = count - len(self._memory[0])
         if more > 0:
-            self._memory = self._memory.grown(more)
-            if dim > MAX_DIM:
-                self._lists = np.pad(self._lists, ((0, more), (0, 0)))
-                self._limits = np.pad(self._limits, (0, more), constant_values=-np.inf)
+            both = zip(self._memory, _blank_memory(more, dim), strict=True)
+            self._memory = tuple(map(np.concatenate, both))
 
     def _search_boxes(self, x: Array, codebook: Array, rows: Array) -> Array:
         if self._steps % 32 == 0 or self._order is None:  # boxes in an old order are larger
             self._order = sort_into_leaves(codebook)
         self._drift(codebook, 1)
-        return box_search(x, codebook, self._order, rows, self._memory, self._travelled)
+        return box_search(x, codebook, self._order, rows, self._memory[:3], self._travelled)
 
     def _search_lists(self, x: Array, codebook: Array, rows: Array) -> Array:
         # How far a code has moved is the sum of its distances from snapshot to snapshot: the more snapshots, the more a
         # random walk counts as if it were a straight line.
         drift = self._drift(codebook, 16)
         result = np.empty(len(rows), np.int64)
-        last, anchors, clearance = self._memory
-        memory = last, self._lists.ravel(), anchors.ravel(), clearance, self._limits
+        last, anchors, clearance, lists, limits = self._memory
+        memory = tuple(array.ravel() for array in self._memory)
         thread_count()
         blocks = -(-len(rows) // _BLOCK)
         check = _check_kernel(x.shape[1])
@@ -189,10 +202,10 @@ class NearestTracker:
             drift = self._take_snapshot(codebook, drift)
         if len(unsure):
             where = rows[unsure]
-            found, lists, distances = score_search(x[where], codebook, with_lists=True)
+            found, lists[where], distances = score_search(x[where], codebook, with_lists=True)
             last[where] = result[unsure] = found
-            self._lists[where], anchors[where] = lists, x[where]
-            self._limits[where], clearance[where] = distances / ROUNDING - drift + self._travelled
+            anchors[where] = x[where]
+            limits[where], clearance[where] = distances / ROUNDING - drift + self._travelled
         return result
 
     def _drift(self, codebook: Array, every: int) -> float:
