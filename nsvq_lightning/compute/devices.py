@@ -157,8 +157,7 @@ class AsyncScalar:
         if value.is_cuda:
             self._host = torch.empty((), dtype=value.dtype, pin_memory=True)
             self._host.copy_(value.detach(), non_blocking=True)
-            self._copied = torch.cuda.Event()
-            self._copied.record(torch.cuda.current_stream(value.device))
+            self._copied = torch.cuda.current_stream(value.device).record_event()
 
     @property
     def is_here(self) -> bool:

@@ -270,7 +270,7 @@ class CodebookQuantizer(nn.Module, ABC):
             TypeError: The codes are not int64.
         """
         self._check_codes(codes)
-        self.codes = codes.detach().clone().to(self.codebook.device)
+        self.codes = codes.to(self.codebook.device, copy=True)
         self.held = self.held.new_zeros(0)
 
     def hold(self, codes: Tensor) -> None:
@@ -282,7 +282,7 @@ class CodebookQuantizer(nn.Module, ABC):
         """
         if codes.numel() > 0:
             self._check_codes(codes)
-        self.held = codes.detach().clone().to(self.codebook.device)
+        self.held = codes.to(self.codebook.device, copy=True)
 
     def _check_codes(self, codes: Tensor) -> None:
         if codes.dtype != torch.int64:

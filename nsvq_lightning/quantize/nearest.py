@@ -143,12 +143,10 @@ def cheapest_reference(x: Tensor, codebook: Tensor, rates: Tensor, prices: Tenso
 
 
 def _blocks(codebook: Array, rates: Array) -> Array:
-    """Blocks of 16 codes, ``[⌈K/16⌉, D + 1, 16]`` flat: their values, infinite in lanes without a code, and rates."""
-    count, dim = codebook.shape
-    padded = np.zeros((-(-count // 16) * 16, dim + 1), np.float32)
-    padded[count:, :dim] = np.inf
-    padded[:count, :dim], padded[:count, dim] = codebook, rates
-    return np.ascontiguousarray(padded.reshape(-1, 16, dim + 1).transpose(0, 2, 1)).ravel()
+    """Blocks of 16 codes, ``[⌈K/16⌉, D + 1, 16]`` flat: their values, and rates; infinite in lanes without a code."""
+    table = np.c_[codebook, rates]
+    padded = np.pad(table, ((0, -len(table) % 16), (0, 0)), constant_values=np.inf)
+    return padded.reshape(-1, 16, table.shape[1]).transpose(0, 2, 1).ravel()
 
 
 @cache

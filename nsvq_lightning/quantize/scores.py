@@ -168,11 +168,6 @@ def _score_block(dim, blocks, halves, block, rows, first, kept, state):
 
 @inline
 def _score_tile(dim, blocks, halves, rows, count, kept, state):
-    scores, _, limits, _, _ = state
-    for i in range(count * _BEST):
-        simd.put(scores, i, F(np.inf))
-    for i in range(count):
-        simd.put(limits, i, F(np.inf))
     total = halves.shape[0] // 32
     for chunk in range(0, total, _CHUNK):
         for first in range(0, count, _GROUP):
@@ -217,8 +212,9 @@ def _search_kernel(dim: int) -> Any:
         kept = _BEST if with_lists else _BEST_ALONE
         rounding = F(2.0 * (dim + 8) * 2.0**-24)
         rows, squared = np.empty(_TILE * dim, np.float32), np.zeros(_TILE, np.float32)
-        scores, codes = np.empty(_TILE * _BEST, np.float32), np.zeros(_TILE * _BEST, np.int32)
-        limits, slack, margins = np.empty(_TILE, np.float32), np.empty(_TILE, np.float32), np.empty(_TILE, np.float32)
+        scores, codes = np.full(_TILE * _BEST, F(np.inf)), np.zeros(_TILE * _BEST, np.int32)
+        limits = np.full(_TILE, F(np.inf))
+        slack, margins = np.empty(_TILE, np.float32), np.empty(_TILE, np.float32)
         state = scores, codes, limits, slack, np.empty(32 * _GROUP, np.float32)
         start, valid = tile * _TILE, min(_TILE, count - tile * _TILE)
         for i in range(_TILE):

@@ -17,11 +17,12 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
-from nsvq_lightning.compute.memory import INT64, Array, flat_checked, outside, recycled
+from nsvq_lightning.compute.memory import check_tensor, flat, outside, recycled
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside
 from nsvq_lightning.quantize.scores import new_lanes
 
@@ -260,23 +261,29 @@ def substitute(
         ValueError: The tensors do not fit together, one is not contiguous, or a row or code is out of range.
         TypeError: A dtype is wrong.
     """
-    inputs = _checked(x, rows, codebook, codes)
+    check_inputs(x, rows, codebook, codes)
     out = recycled((len(rows), x.shape[1]))
     thread_count()
     blocks = -(-len(rows) // _ROWS)
-    if _forward(x.shape[1])(blocks, seed, F(aim), F(spread), *inputs, out.numpy().reshape(-1)):
+    tables = map(flat, (x, rows, codebook, codes, out))
+    if _forward(x.shape[1])(blocks, seed, F(aim), F(spread), *tables):
         raise _missing(x, rows, codebook, codes)
     return out
 
 
-def _checked(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> tuple[Array, ...]:
-    """The memory of the tensors."""
-    return (
-        flat_checked("x", x, (len(x), codebook.shape[-1])),
-        flat_checked("rows", rows, (rows.numel(),), INT64),
-        flat_checked("codebook", codebook, (len(codebook), x.shape[1])),
-        flat_checked("codes", codes, (len(rows),), INT64),
-    )
+def check_inputs(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, **chosen: Tensor) -> None:
+    """Refuse tensors that do not fit together; ``chosen`` have one row ``[V, D]`` for each of ``rows [V]``.
+
+    Raises:
+        ValueError: The shapes or devices do not fit together, or one is not contiguous.
+        TypeError: A dtype is wrong.
+    """
+    check_tensor("x", x, (len(x), codebook.shape[-1]), x.device)
+    check_tensor("rows", rows, (rows.numel(),), x.device, torch.int64)
+    check_tensor("codebook", codebook, (len(codebook), x.shape[1]), x.device)
+    check_tensor("codes", codes, (len(rows),), x.device, torch.int64)
+    for name, table in chosen.items():
+        check_tensor(name, table, (len(rows), x.shape[1]), x.device)
 
 
 def _missing(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> ValueError:
@@ -297,15 +304,14 @@ def substitute_backward(
         ValueError: As for :func:`substitute`.
         TypeError: A dtype is wrong.
     """
-    inputs = _checked(x, rows, codebook, codes)
-    shape = len(rows), x.shape[1]
-    slope, moved = flat_checked("grad", grad, shape), flat_checked("out", out, shape)
+    check_inputs(x, rows, codebook, codes, grad=grad, out=out)
     grad_x, grad_codebook = recycled(x.shape), recycled(codebook.shape)
     # Enough parts for the threads, few enough that adding them up is cheap.
     parts = max(4, min(64, len(rows) // (4 * len(codebook))))
     sums = recycled((parts, codebook.numel())).numpy()
     thread_count()
-    if _backward(x.shape[1])(parts, slope, *inputs, moved, grad_x.numpy().reshape(-1), sums):
+    tables = map(flat, (grad, x, rows, codebook, codes, out, grad_x))
+    if _backward(x.shape[1])(parts, *tables, sums):
         raise _missing(x, rows, codebook, codes)
     np.add.reduce(sums, axis=0, out=grad_codebook.numpy().reshape(-1))
     return grad_x, grad_codebook

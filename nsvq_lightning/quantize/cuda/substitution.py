@@ -144,13 +144,6 @@ def _tile(dim: int) -> dict[str, int]:
     return {"DIM": dim, "WIDTH": width, "ROWS": max(1, 1024 // width)}  # 1024 elements per program
 
 
-def _check(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> None:
-    check_tensor("x", x, (len(x), codebook.shape[-1]), x.device)
-    check_tensor("rows", rows, (rows.numel(),), x.device, torch.int64)
-    check_tensor("codebook", codebook, (len(codebook), x.shape[1]), x.device)
-    check_tensor("codes", codes, (len(rows),), x.device, torch.int64)
-
-
 def substitute(
     seed: int, x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, *, aim: float, spread: float
 ) -> Tensor:
@@ -169,7 +162,7 @@ def substitute(
         ValueError: The tensors do not fit together, or one is not contiguous.
         TypeError: A dtype is wrong.
     """
-    _check(x, rows, codebook, codes)
+    substitution.check_inputs(x, rows, codebook, codes)
     out = x.new_empty(len(rows), x.shape[1])
     tile = _tile(x.shape[1])
     if len(rows):
@@ -192,9 +185,7 @@ def substitute_backward(
         ValueError: As for :func:`substitute`.
         TypeError: A dtype is wrong.
     """
-    _check(x, rows, codebook, codes)
-    for name, table in (("grad", grad), ("out", out)):
-        check_tensor(name, table, (len(rows), x.shape[1]), x.device)
+    substitution.check_inputs(x, rows, codebook, codes, grad=grad, out=out)
     grad_x, radials = torch.zeros_like(x), torch.empty_like(out)
     tile = _tile(x.shape[1])
     if len(rows):
