@@ -48,7 +48,6 @@ class _Compilations(event.Listener):
     """
 
     def __init__(self) -> None:
-        self.announced = False
         self.seconds = self.since = 0.0
         # LLVM's level before each compilation in progress, of a kernel and its helpers.
         self.levels: list[int] = []
@@ -58,8 +57,7 @@ class _Compilations(event.Listener):
             return
         if not self.levels:
             self.since = time.perf_counter()
-            if not self.announced:
-                self.announced = True
+            if self.seconds == 0:
                 log.info("compiling kernels, once on this machine: a quarter of a minute to one")
         level = numba.config.OPT
         self.levels.append(level)

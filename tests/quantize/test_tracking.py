@@ -33,7 +33,7 @@ def searched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     def counting_boxes(x, codebook, boxes, rows, memory, travelled):  # type: ignore[no-untyped-def]
         found = by_boxes(x, codebook, boxes, rows, memory, travelled)
         # A row that a bound has settled is still remembered where it was.
-        counts.append(int((memory.anchors[rows] == x[rows]).all(1).sum()))
+        counts.append(int((memory[1][rows] == x[rows]).all(1).sum()))
         return found
 
     monkeypatch.setattr(tracking_module, "score_search", counting_scores)

@@ -27,7 +27,7 @@ ROWS = tl.constexpr(8)  # rows per program of a search
 CODES = tl.constexpr(128)  # codes that it compares its rows with at a time
 BLOCK = tl.constexpr(64)  # rows, or codes, per program of a check
 COPIED = tl.constexpr(1024)  # numbers per program of a copy
-MEMBERS = tl.constexpr(LIST)
+MEMBERS = tl.constexpr(LIST)  # codes in the list of a row
 SLACK = tl.constexpr(ROUNDING)
 
 
