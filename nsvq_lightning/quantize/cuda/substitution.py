@@ -97,7 +97,7 @@ def chosen_rows(
 @triton.jit
 def inverses(squared):
     """1/s, and 0 where s is 0 (or its inverse too large): a zero vector has no direction."""
-    return tl.where(squared > TINY, 1 / tl.where(squared > TINY, squared, 1.0), 0.0)
+    return tl.where(squared > TINY, 1 / squared, 0.0)
 
 
 @triton.jit(do_not_specialize=["seed", "count", "height"])
@@ -208,7 +208,7 @@ def part_kernel(values, order, offsets, partial, dim, WIDTH: tl.constexpr):
     """Sum a part of a code's rows ``order[offsets[code]:offsets[code + 1]]`` in the dtype of ``partial``."""
     program = tl.program_id(0).to(tl.int64)
     code, part = program // PARTS, (program % PARTS).to(tl.int32)
-    column = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)[None, :]
+    column = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)
     begin, end = tl.load(offsets + code), tl.load(offsets + code + 1)
     size = part_size(begin, end)
     first = begin + part * size
@@ -220,8 +220,7 @@ def part_kernel(values, order, offsets, partial, dim, WIDTH: tl.constexpr):
             row = tl.load(order + place, mask=place < last, other=0)
             value = tl.load(values + row * dim + column, mask=(place < last) & (column < dim), other=0.0)
             total += value.to(partial.dtype.element_ty)
-        lane = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)
-        tl.store(partial + program * dim + lane, tl.sum(total, 0), mask=lane < dim)
+        tl.store(partial + program * dim + column, tl.sum(total, 0), mask=column < dim)
 
 
 @triton.jit
