@@ -29,6 +29,7 @@ WIDTH = 16
 _f32, _i1, _i8, _i16, _i32, _i64 = ir.FloatType(), *(ir.IntType(bits) for bits in (1, 8, 16, 32, 64))
 _VF, _VI, _VM = (ir.VectorType(kind, WIDTH) for kind in (_f32, _i32, _i1))
 _CONTRACT = ("contract", "nsz")
+_add = functools.partial(ir.IRBuilder.fadd, flags=_CONTRACT)
 
 # Stands for the type of the elements of the first argument.
 _ELEMENT = object()
@@ -107,9 +108,6 @@ def _opened(context, builder, kind, value):
 
 # ---- building blocks in LLVM
 # ------------------------------------------------------------------------------------------
-
-
-_add = functools.partial(ir.IRBuilder.fadd, flags=_CONTRACT)
 
 
 def _constant(value):
