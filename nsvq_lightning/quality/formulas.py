@@ -50,12 +50,13 @@ def similarity(m1, m2, squares, product):
     by_product = 2 * a * ef
     by_square = -(value * f)
     by_mean = 2 * (m2 * d * ef - m1 * value * e - m1 * by_square) - m2 * by_product
-    return value, by_mean, by_square, by_product
+    return value, (by_mean, by_square, by_product)
 
 
 @inline
-def pixel_gradient(raw, p, q, by_mean, by_square, by_product, l1_step, ssim_step):
+def pixel_gradient(raw, p, q, derivatives, l1_step, ssim_step):
     """Gradient of the loss from the blurred derivatives of SSIM, 0 where the image was clamped."""
+    by_mean, by_square, by_product = derivatives
     g = simd.fma(q, by_product, simd.fma(2 * p, by_square, by_mean))
     sign = simd.where(p > q, l1_step, simd.where(p < q, -l1_step, 0.0))
     return simd.where((raw >= 0) & (raw <= 1), simd.fma(-ssim_step, g, sign), 0.0)

@@ -82,10 +82,8 @@ def moments_of_row(images, y, length, pitch, moments):
         sums = formulas.moments(TAPS[0], simd.load(images, o), simd.load(images, o + pitch))
         for distance in range(1, SSIM_RADIUS + 1):
             sums = add_pair(images, y, distance, x, pitch, TAPS[distance], sums)
-        simd.store(moments, PAD + x, sums[0])
-        simd.store(moments, pitch + PAD + x, sums[1])
-        simd.store(moments, 2 * pitch + PAD + x, sums[2])
-        simd.store(moments, 3 * pitch + PAD + x, sums[3])
+        for plane in range(MOMENTS):
+            simd.store(moments, plane * pitch + PAD + x, sums[plane])
 
 
 @inline
@@ -98,10 +96,10 @@ def similarity_of_row(moments, derivatives, length, pitch, lanes):
         o = PAD + x
         m1, m2 = blur_along(moments, o), blur_along(moments, pitch + o)
         squares, product = blur_along(moments, 2 * pitch + o), blur_along(moments, 3 * pitch + o)
-        similarity, by_mean, by_square, by_product = formulas.similarity(m1, m2, squares, product)
-        simd.store(derivatives, o, by_mean)
-        simd.store(derivatives, pitch + o, by_square)
-        simd.store(derivatives, 2 * pitch + o, by_product)
+        similarity, slopes = formulas.similarity(m1, m2, squares, product)
+        simd.store(derivatives, o, slopes[0])
+        simd.store(derivatives, pitch + o, slopes[1])
+        simd.store(derivatives, 2 * pitch + o, slopes[2])
         total = total + simd.where(lane >= F(x_ - x), similarity, 0)
     return simd.lane_sum(total)
 
@@ -133,9 +131,9 @@ def gradient_of_row(image, gradient, images, ring, y, length, pitch, l1_step, ss
         o = row_of(y, IMAGES, pitch) + x
         p, q = simd.load(images, o), simd.load(images, o + pitch)
         raw = simd.load(image, y * length + x)
-        by_mean, by_square = blur_across(ring, y, 0, PAD + x, pitch), blur_across(ring, y, 1, PAD + x, pitch)
-        by_product = blur_across(ring, y, 2, PAD + x, pitch)
-        g = formulas.pixel_gradient(raw, p, q, by_mean, by_square, by_product, l1_step, ssim_step)
+        o = PAD + x
+        slopes = blur_across(ring, y, 0, o, pitch), blur_across(ring, y, 1, o, pitch), blur_across(ring, y, 2, o, pitch)
+        g = formulas.pixel_gradient(raw, p, q, slopes, l1_step, ssim_step)
         simd.store(gradient, y * length + x, g)
         total = total + simd.where(lane >= F(x_ - x), simd.abs(p - q), 0)
     return simd.lane_sum(total)

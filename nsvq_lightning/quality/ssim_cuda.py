@@ -110,21 +110,18 @@ def moments_kernel(
 
 
 @triton.jit
-def blur_down(plane, at):
-    """Eleven taps down a plane."""
+def blur(plane, at, down, along):
+    """Eleven taps of a plane that are so many rows and floats apart."""
     total = load_at(plane, at, 0, 0) * TAPS[0]
     for k in tl.static_range(1, RADIUS + 1):
-        total += (load_at(plane, at, -k, 0) + load_at(plane, at, k, 0)) * TAPS[k]
+        total += (load_at(plane, at, -k * down, -k * along) + load_at(plane, at, k * down, k * along)) * TAPS[k]
     return total
 
 
 @triton.jit
 def blur_along(plane, at):
     """Eleven taps along the rows of interleaved RGB: neighbouring pixels are 3 floats apart."""
-    total = load_at(plane, at, 0, 0) * TAPS[0]
-    for k in tl.static_range(1, RADIUS + 1):
-        total += (load_at(plane, at, 0, -3 * k) + load_at(plane, at, 0, 3 * k)) * TAPS[k]
-    return total
+    return blur(plane, at, 0, 3)
 
 
 @triton.jit
@@ -138,13 +135,12 @@ def similarity_kernel(
     m2 = blur_along(plane_of(moments, 1, at), at)
     squares = blur_along(plane_of(moments, 2, at), at)
     product = blur_along(plane_of(moments, 3, at), at)
-    similarity, by_mean, by_square, by_product = formulas.similarity(m1, m2, squares, product)
+    similarity, slopes = formulas.similarity(m1, m2, squares, product)
     _, inside = pointers(moments, at, 0, 0)
     tl.store(sums + 2 * program + 1, tl.sum(tl.sum(tl.where(inside, similarity, 0.0), 1), 0))
     if DERIVED:
-        store_at(derivatives, at, by_mean)
-        store_at(plane_of(derivatives, 1, at), at, by_square)
-        store_at(plane_of(derivatives, 2, at), at, by_product)
+        for plane in tl.static_range(len(slopes)):
+            store_at(plane_of(derivatives, plane, at), at, slopes[plane])
 
 
 @triton.jit
@@ -166,7 +162,7 @@ def spread_kernel(derivatives, blurred, height, length, ROWS: tl.constexpr, COLU
     """Vertical blur of one derivative plane, the one selected by the third axis of the grid."""
     at = place(height, length, ROWS, COLUMNS)
     plane = tl.program_id(2)
-    spread = blur_down(plane_of(derivatives, plane, at), at)
+    spread = blur(plane_of(derivatives, plane, at), at, 1, 0)
     store_at(plane_of(blurred, plane, at), at, spread)
 
 
@@ -180,10 +176,8 @@ def gradient_kernel(
     squares, products = plane_of(blurred, 1, at), plane_of(blurred, 2, at)  # first, which saves registers
     raw = load_at(image, at, 0, 0)
     p, q = pixels(image, target, at, 0, BYTES)
-    by_mean = blur_along(blurred, at)
-    by_square = blur_along(squares, at)
-    by_product = blur_along(products, at)
-    value = formulas.pixel_gradient(raw, p, q, by_mean, by_square, by_product, l1_step, ssim_step)
+    slopes = (blur_along(blurred, at), blur_along(squares, at), blur_along(products, at))
+    value = formulas.pixel_gradient(raw, p, q, slopes, l1_step, ssim_step)
     store_at(gradient, at, value * tl.load(scale))
 
 

@@ -80,18 +80,28 @@ def tile_range(boxes, place):
 
 
 @inline
-def _count_tiles(thread, threads, count, order, boxes, group_columns, histogram):
+def _visit_tiles(thread, threads, count, order, boxes, group_columns, histogram, ids, entries):
+    """Count the splats of every tile; or write their rows (``ids``, by place) into its list, keeping the order."""
     row = histogram[thread]
-    row[:] = 0
+    if entries is None:
+        row[:] = 0
     first, end = share(count, thread, threads)
     for i in range(first, end):
         if i + AHEAD < end:
-            prefetch(boxes, np.int64(get(order, i + AHEAD)))
-        x0, y0, x1, y1 = tile_range(boxes, np.int64(get(order, i)))
+            coming = np.int64(get(order, i + AHEAD))
+            prefetch(boxes, coming)
+            if entries is not None:
+                prefetch(ids, coming)
+        place = np.int64(get(order, i))
+        x0, y0, x1, y1 = tile_range(boxes, place)
+        splat_row = None if entries is None else get(ids, place)
         for y in range(y0, y1):
             for x in range(x0, x1):
                 tile = tile_index(x, y, group_columns)
-                put(row, tile, get(row, tile) + 1)
+                entry = get(row, tile)
+                put(row, tile, entry + 1)
+                if entries is not None:
+                    put(entries, entry, splat_row)
 
 
 @kernel
@@ -102,7 +112,7 @@ def count_tiles(threads, count, order, boxes, group_columns, histogram, offsets)
     row, number of columns and rows, 16 bits each. ``histogram`` [threads, tiles] becomes the position of each thread's
     first entry in every tile.
     """
-    in_parallel(_count_tiles, threads, (count, order, boxes, group_columns, histogram))
+    in_parallel(_visit_tiles, threads, (count, order, boxes, group_columns, histogram, None, None))
     tiles = offsets.shape[0] - 1
     total = 0
     for tile in range(tiles):
@@ -118,18 +128,4 @@ def count_tiles(threads, count, order, boxes, group_columns, histogram, offsets)
 @parallel
 def fill_tiles(thread, threads, count, order, boxes, group_columns, histogram, ids, entries):
     """Write the row of every splat (``ids``, by place) into the lists of its tiles, keeping the order."""
-    row = histogram[thread]
-    first, end = share(count, thread, threads)
-    for i in range(first, end):
-        if i + AHEAD < end:
-            prefetch(boxes, np.int64(get(order, i + AHEAD)))
-            prefetch(ids, np.int64(get(order, i + AHEAD)))
-        place = np.int64(get(order, i))
-        x0, y0, x1, y1 = tile_range(boxes, place)
-        splat_row = get(ids, place)
-        for y in range(y0, y1):
-            for x in range(x0, x1):
-                tile = tile_index(x, y, group_columns)
-                entry = get(row, tile)
-                put(row, tile, entry + 1)
-                put(entries, entry, splat_row)
+    _visit_tiles(thread, threads, count, order, boxes, group_columns, histogram, ids, entries)

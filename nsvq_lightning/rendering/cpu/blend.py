@@ -156,9 +156,8 @@ def load_color(state, o):
 @inline
 def store_color(state, o, color):
     """The inverse of :func:`load_color`."""
-    simd.store(state, R_SUM + o, color[0])
-    simd.store(state, G_SUM + o, color[1])
-    simd.store(state, B_SUM + o, color[2])
+    for channel in range(3):
+        simd.store(state, R_SUM + 256 * channel + o, color[channel])
 
 
 @inline
@@ -226,9 +225,8 @@ def write_block(block, corner, size, background, state, planes):
             s = o + lane
             simd.put(transmittance, pixel, simd.get(state, T_LEFT + s))
             simd.put(depth, pixel, simd.get(state, Z_SUM + s))
-            simd.put(image, 3 * pixel, simd.get(state, R_SUM + s))
-            simd.put(image, 3 * pixel + 1, simd.get(state, G_SUM + s))
-            simd.put(image, 3 * pixel + 2, simd.get(state, B_SUM + s))
+            for channel in range(3):
+                simd.put(image, 3 * pixel + channel, simd.get(state, R_SUM + 256 * channel + s))
 
 
 @inline
@@ -422,8 +420,8 @@ def splat_backward(records, row, blocks, corner, wanted, state):
             s_z = simd.fma(weight, simd.load(state, s + BACK_DEPTH), s_z)
         if with_absgrad:
             along_y = simd.fma(b, hu, c * hv)
-            s_ax = s_ax + simd.maximum(hu, 0 - hu)
-            s_ay = s_ay + simd.maximum(along_y, 0 - along_y)
+            s_ax = s_ax + simd.abs(hu)
+            s_ay = s_ay + simd.abs(along_y)
             s_map = simd.fma(weight, simd.load(state, s + BACK_WEIGHT), s_map)
     return simd.lane_sums((*s_color, s_h, s_u, s_v, *s_squares, s_z, s_ax, s_ay, s_map))
 

@@ -117,14 +117,15 @@ def direction_gradient(degree, d, e):
 
 
 @inline
-def put_band(gradient, e, columns, k, basis, rgb):
-    """Write the gradient columns of coefficient k, and its share of the direction gradient."""
-    o = 48 * k
-    total = simd.load(columns, o) * rgb[0]
-    total = simd.fma(simd.load(columns, o + 16), rgb[1], total)
-    simd.store(e, 16 * k, simd.fma(simd.load(columns, o + 32), rgb[2], total))
-    for channel in range(3):
-        simd.store(gradient, o + 16 * channel, basis * rgb[channel])
+def put_bands(gradient, e, columns, first, basis, rgb):
+    """Write the gradient columns of coefficients from the ``first`` on, and their shares of the direction gradient."""
+    for i in range(len(basis)):
+        o = 48 * (first + i)
+        total = simd.load(columns, o) * rgb[0]
+        total = simd.fma(simd.load(columns, o + 16), rgb[1], total)
+        simd.store(e, 16 * (first + i), simd.fma(simd.load(columns, o + 32), rgb[2], total))
+        for channel in range(3):
+            simd.store(gradient, o + 16 * channel, basis[i] * rgb[channel])
 
 
 @inline
@@ -156,16 +157,10 @@ def color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, scra
     if degree == 0:
         scatter_sh(g_shN, gradient, ids, start, stride, 0)
         return simd.broadcast(0), simd.broadcast(0), simd.broadcast(0)
-    b1 = bands1(d)
-    for i in range(3):
-        put_band(gradient, e, columns, i, b1[i], rgb)
+    put_bands(gradient, e, columns, 0, bands1(d), rgb)
     if degree > 1:
-        b2 = bands2(d)
-        for i in range(5):
-            put_band(gradient, e, columns, 3 + i, b2[i], rgb)
+        put_bands(gradient, e, columns, 3, bands2(d), rgb)
     if degree > 2:
-        b3 = bands3(d)
-        for i in range(7):
-            put_band(gradient, e, columns, 8 + i, b3[i], rgb)
+        put_bands(gradient, e, columns, 8, bands3(d), rgb)
     scatter_sh(g_shN, gradient, ids, start, stride, coefficients)
     return mean_gradient(d, inverse, direction_gradient(degree, d, e))

@@ -30,10 +30,12 @@ def store3(pointer, values, mask):
 
 
 @triton.jit
-def add_band(row, k, basis, rgb, mask):
-    """Add coefficient k, counted without the constant one, times its basis value to a colour."""
-    r, g, b = load3(row + 3 * k, mask)
-    return rgb[0] + r * basis, rgb[1] + g * basis, rgb[2] + b * basis
+def add_bands(row, first, basis, rgb, mask):
+    """Add coefficients from the ``first`` on, counted without the constant one, times their basis values to a colour."""
+    for k in tl.static_range(len(basis)):
+        r, g, b = load3(row + 3 * (first + k), mask)
+        rgb = (rgb[0] + r * basis[k], rgb[1] + g * basis[k], rgb[2] + b * basis[k])
+    return rgb
 
 
 @triton.jit
@@ -42,27 +44,28 @@ def color(first, row, d, mask, DEGREE: tl.constexpr):
     r, g, b = load3(first, mask)
     rgb = (r * formulas.C0 + 0.5, g * formulas.C0 + 0.5, b * formulas.C0 + 0.5)
     if DEGREE > 0:
-        b1 = formulas.bands1(d)
-        for k in tl.static_range(3):
-            rgb = add_band(row, k, b1[k], rgb, mask)
+        rgb = add_bands(row, 0, formulas.bands1(d), rgb, mask)
     if DEGREE > 1:
-        b2 = formulas.bands2(d)
-        for k in tl.static_range(5):
-            rgb = add_band(row, 3 + k, b2[k], rgb, mask)
+        rgb = add_bands(row, 3, formulas.bands2(d), rgb, mask)
     if DEGREE > 2:
-        b3 = formulas.bands3(d)
-        for k in tl.static_range(7):
-            rgb = add_band(row, 8 + k, b3[k], rgb, mask)
+        rgb = add_bands(row, 8, formulas.bands3(d), rgb, mask)
     return rgb
 
 
 @triton.jit
-def put_band(rows, k, basis, rgb, masks):
-    """Store the gradient of coefficient k; returns Σ_channel coefficient·gradient, the gradient of the basis value."""
+def put_bands(rows, first, basis, rgb, masks):
+    """Store the gradients of coefficients from the ``first`` on; returns those of their basis values.
+
+    These are Σ_channel coefficient·gradient.
+    """
     row, g_row = rows
     mask, inside = masks
-    store3(g_row + 3 * k, formulas.scale3(basis, rgb), inside)
-    return formulas.dot3(load3(row + 3 * k, mask), rgb)
+    gradients = ()
+    for k in tl.static_range(len(basis)):
+        o = 3 * (first + k)
+        store3(g_row + o, formulas.scale3(basis[k], rgb), inside)
+        gradients += (formulas.dot3(load3(row + o, mask), rgb),)
+    return gradients
 
 
 @triton.jit
@@ -75,33 +78,11 @@ def color_backward(g_first, rows, d, rgb, masks, DEGREE: tl.constexpr):
     store3(g_first, formulas.scale3(formulas.C0, rgb), masks[1])
     gradient = (tl.zeros_like(rgb[0]), tl.zeros_like(rgb[0]), tl.zeros_like(rgb[0]))
     if DEGREE > 0:
-        b1 = formulas.bands1(d)
-        e1 = (
-            put_band(rows, 0, b1[0], rgb, masks),
-            put_band(rows, 1, b1[1], rgb, masks),
-            put_band(rows, 2, b1[2], rgb, masks),
-        )
-        gradient = formulas.direction_gradient1(e1)
+        gradient = formulas.direction_gradient1(put_bands(rows, 0, formulas.bands1(d), rgb, masks))
     if DEGREE > 1:
-        b2 = formulas.bands2(d)
-        e2 = (
-            put_band(rows, 3, b2[0], rgb, masks),
-            put_band(rows, 4, b2[1], rgb, masks),
-            put_band(rows, 5, b2[2], rgb, masks),
-            put_band(rows, 6, b2[3], rgb, masks),
-            put_band(rows, 7, b2[4], rgb, masks),
-        )
-        gradient = formulas.direction_gradient2(gradient, d, e2)
+        e = put_bands(rows, 3, formulas.bands2(d), rgb, masks)
+        gradient = formulas.direction_gradient2(gradient, d, e)
     if DEGREE > 2:
-        b3 = formulas.bands3(d)
-        e3 = (
-            put_band(rows, 8, b3[0], rgb, masks),
-            put_band(rows, 9, b3[1], rgb, masks),
-            put_band(rows, 10, b3[2], rgb, masks),
-            put_band(rows, 11, b3[3], rgb, masks),
-            put_band(rows, 12, b3[4], rgb, masks),
-            put_band(rows, 13, b3[5], rgb, masks),
-            put_band(rows, 14, b3[6], rgb, masks),
-        )
-        gradient = formulas.direction_gradient3(gradient, d, e3)
+        e = put_bands(rows, 8, formulas.bands3(d), rgb, masks)
+        gradient = formulas.direction_gradient3(gradient, d, e)
     return gradient
