@@ -9,7 +9,7 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import resolve_backend
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats.attributes import ATTRIBUTES
-from nsvq_lightning.splats.splats import SplatTensors, check_shapes, sh_degree_of
+from nsvq_lightning.splats.splats import RawSplats, SplatTensors, check_shapes, sh_degree_of
 
 
 class Render(NamedTuple):
@@ -67,7 +67,7 @@ def render(
             differ in device or type, or whose shapes do not fit; ``sh_degree`` above the stored degree; a background
             that is not ``[3]``; pixel weights that is not ``[H, W]``.
     """
-    _check_alike(splats)
+    splats = _checked(splats)
     stored = sh_degree_of(splats.shN)
     degree = stored if sh_degree is None else sh_degree
     if not 0 <= degree <= stored:
@@ -92,15 +92,16 @@ def render(
     return Render(image, alpha, radii, means2d, depth, absgrad)
 
 
-def _check_alike(splats: SplatTensors) -> None:
-    """Refuse attributes whose dtype or device differs from that of the means, which the kernels assume for all."""
-    tensors = {name: getattr(splats, name) for name in ATTRIBUTES}
+def _checked(splats: SplatTensors) -> RawSplats:
+    """The attributes, contiguous; refuses those of another dtype or on another device than the means."""
+    tensors = {name: getattr(splats, name).contiguous() for name in ATTRIBUTES}
     check_shapes(tensors)
     kinds = {name: (tensor.dtype, tensor.device) for name, tensor in tensors.items()}
     for name, kind in kinds.items():
         if kind != kinds["means"]:
             expected = " on ".join(map(str, kinds["means"]))
             raise ValueError(f"{name} must be {expected} as the means are, got {' on '.join(map(str, kind))}")
+    return RawSplats(**tensors)
 
 
 @torch.no_grad()
@@ -115,7 +116,7 @@ def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> T
     Raises:
         ValueError: As for :func:`render`.
     """
-    _check_alike(splats)
+    splats = _checked(splats)
     rows: Tensor = _module_of(backend, splats.means).visible(splats, camera)
     return rows
 

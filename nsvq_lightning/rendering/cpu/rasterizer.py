@@ -15,15 +15,7 @@ from nsvq_lightning.rendering.cpu import blend as blending
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.attributes import ATTRIBUTES
-from nsvq_lightning.splats.splats import SplatTensors
-
-
-def _geometry(splats: SplatTensors) -> tuple[Array, ...]:
-    """Means, rotations, scales and opacities, flat."""
-    n = len(splats.means)
-    shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
-    return tuple(flat_checked(name, getattr(splats, name).contiguous(), shape) for name, shape in shapes.items())
-
+from nsvq_lightning.splats.splats import RawSplats
 
 PROJECTION_SCRATCH = 2048 + 64
 
@@ -31,14 +23,18 @@ PROJECTION_SCRATCH = 2048 + 64
 class _Frame:
     """One view of the splats on its way through the stages; holds its workspace for as long as it lives."""
 
-    def __init__(self, splats: SplatTensors, camera: Camera, antialiased: bool | None = None) -> None:
+    def __init__(self, splats: RawSplats, camera: Camera, degree: int, antialiased: bool | None) -> None:
         self.camera = rec.pack_camera(camera)
         self.antialiased = antialiased
         self.size = width, height = camera.width, camera.height
         self.group_columns, group_rows = rec.group_grid(width, height)
         self.tiles = self.group_columns * group_rows * rec.GROUP_TILES
-        self.n = splats.means.shape[0]
-        self.geometry = _geometry(splats)
+        self.n = n = splats.means.shape[0]
+        coefficients = splats.shN.shape[1]
+        shapes = (n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, coefficients, 3)
+        attributes = tuple(map(flat_checked, ATTRIBUTES, splats, shapes))
+        self.geometry, self.colors = attributes[:4], attributes[4:]
+        self.bands = 3 * coefficients, degree
         self.threads = thread_count()
         self.work = Workspace.borrow()
         self.records = self.work.array("records", rec.RECORD * self.n)
@@ -61,7 +57,7 @@ class _Frame:
         )  # fmt: skip
         return found, counts, slots
 
-    def project(self, colors: tuple[Array, Array], bands: tuple[int, int], means2d: Array, radii: Array) -> None:
+    def project(self, means2d: Array, radii: Array) -> None:
         """Write the records; list the visible splats by row (``ids``) and, as places in it, by depth (``order``)."""
         found, counts, slots = self.find()
         self.count, self.slots = int(counts.sum()), int(slots.sum())
@@ -72,8 +68,9 @@ class _Frame:
         listed = self.ids, keys, order, self.boxes
         projection.join_runs(self.threads, (found, counts, slots), self.records, self.integers, listed, means2d, radii)
         projection.add_colors(
-            self.threads, self.camera, self.geometry[0], colors, bands, self.ids, self.count, self.records, self.scratch
-        )
+            self.threads, self.camera, self.geometry[0], self.colors, self.bands, self.ids, self.count, self.records,
+            self.scratch,
+        )  # fmt: skip
         if self.count:
             other = self.work.array("order2", self.count, np.int32)
             keys2 = self.work.array("keys2", self.count + 1, np.int32)
@@ -107,12 +104,6 @@ class _Frame:
 _GRID = blending.pixel_grid()
 
 
-def _colors(n: int, sh0: Tensor, shN: Tensor) -> tuple[Array, Array]:
-    """Constant and higher coefficients, flat."""
-    shape = (n, shN.shape[1], 3)
-    return flat_checked("sh0", sh0.contiguous(), (n, 1, 3)), flat_checked("shN", shN.contiguous(), shape)
-
-
 def _check_kept(attributes: tuple[Tensor, ...], shapes: tuple[tuple[int, ...], ...]) -> None:
     """Refuse attributes whose data were replaced since the forward pass, which autograd does not notice."""
     for name, tensor, shape in zip(ATTRIBUTES, attributes, shapes, strict=False):
@@ -127,17 +118,15 @@ class _Project(torch.autograd.Function):
     """Raw attributes to projected centres; the records travel in the frame, and the token links the graph."""
 
     @staticmethod
-    def forward(ctx: Any, frame: _Frame, degree: int, *attributes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        means, *_, sh0, shN = attributes
-        means2d = means.new_zeros(frame.n, 2)
+    def forward(ctx: Any, frame: _Frame, *attributes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        means2d = attributes[0].new_zeros(frame.n, 2)
         radii = torch.zeros(frame.n, dtype=torch.int32)
-        bands = 3 * shN.shape[1], degree
-        ctx.frame, ctx.bands, ctx.shapes = frame, bands, tuple(tuple(tensor.shape) for tensor in attributes)
+        ctx.frame, ctx.shapes = frame, [tensor.shape for tensor in attributes]
         ctx.save_for_backward(*attributes)
-        frame.project(_colors(frame.n, sh0, shN), bands, flat(means2d), flat(radii))
+        frame.project(flat(means2d), flat(radii))
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
-        return means2d, means.new_zeros(()), radii
+        return means2d, means2d.new_zeros(()), radii
 
     @staticmethod
     @once_differentiable
@@ -147,15 +136,14 @@ class _Project(torch.autograd.Function):
             # Only the centres were differentiated, so no blend has written sums.
             frame.clear_sums()
         g_means2d = torch.zeros(frame.n, 2) if g_means2d is None else g_means2d
-        *_, sh0, shN = ctx.saved_tensors
         _check_kept(ctx.saved_tensors, ctx.shapes)
         gradients = [recycled(shape) for shape in ctx.shapes]
         projection_backward.project_backward(
-            frame.threads, frame.camera, frame.antialiased, frame.geometry, _colors(frame.n, sh0, shN)[1], ctx.bands,
-            frame.ids, frame.count, frame.records, frame.integers, frame.sums, flat(g_means2d),
+            frame.threads, frame.camera, frame.antialiased, frame.geometry, frame.colors[1], frame.bands, frame.ids,
+            frame.count, frame.records, frame.integers, frame.sums, flat(g_means2d),
             tuple(map(flat, gradients)), frame.scratch,
         )  # fmt: skip
-        return None, None, *gradients
+        return None, *gradients
 
 
 class _Blend(torch.autograd.Function):
@@ -209,13 +197,13 @@ class _Blend(torch.autograd.Function):
 
 
 def render(
-    splats: SplatTensors,
+    splats: RawSplats,
     camera: Camera,
     sh_degree: int,
     background: Tensor,
-    pixel_weights: Tensor | None = None,
-    absgrad: Tensor | None = None,
-    antialiased: bool | None = None,
+    pixel_weights: Tensor | None,
+    absgrad: Tensor | None,
+    antialiased: bool | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
@@ -225,21 +213,20 @@ def render(
         ValueError: The attributes do not fit together, or the image is too large.
         TypeError: An attribute is not float32.
     """
-    attributes = splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN
-    frame = _Frame(splats, camera, antialiased)
-    means2d, token, radii = _Project.apply(frame, sh_degree, *attributes)
+    frame = _Frame(splats, camera, sh_degree, antialiased)
+    means2d, token, radii = _Project.apply(frame, *splats)
     image, alpha, depth = _Blend.apply(frame, means2d, token, background, pixel_weights, absgrad)
     return image, alpha, radii, means2d, depth
 
 
-def visible(splats: SplatTensors, camera: Camera) -> Tensor:
+def visible(splats: RawSplats, camera: Camera) -> Tensor:
     """Rows ``[V]`` int64, ascending, of the splats that can change the image.
 
     Raises:
         ValueError: The attributes do not fit together, or the image is too large.
         TypeError: An attribute is not float32.
     """
-    frame = _Frame(splats, camera)
+    frame = _Frame(splats, camera, 0, None)
     found, counts, _ = frame.find()
     starts = (rec.vector_share.py_func(frame.n, thread, frame.threads)[0] for thread in range(frame.threads))
     runs = [found[start : start + count] for start, count in zip(starts, counts, strict=True)]

@@ -31,7 +31,7 @@ def store3(pointer, values, mask):
 
 @triton.jit
 def add_bands(row, first, basis, rgb, mask):
-    """Add coefficients from the ``first`` on, counted without the constant one, times their basis values to a colour."""
+    """Add coefficients from the ``first`` on, counted without the constant one, times basis values to a colour."""
     for k in tl.static_range(len(basis)):
         r, g, b = load3(row + 3 * (first + k), mask)
         rgb = (rgb[0] + r * basis[k], rgb[1] + g * basis[k], rgb[2] + b * basis[k])

@@ -10,13 +10,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.binning import Tiles, list_tiles
 from nsvq_lightning.rendering.cuda.blend import blend, blend_backward, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens, project, project_backward, project_radii
-from nsvq_lightning.splats.splats import SplatTensors
-
-
-def _attributes(splats: SplatTensors) -> tuple[Tensor, ...]:
-    """The six raw attributes, contiguous."""
-    six = splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN
-    return tuple(tensor.contiguous() for tensor in six)
+from nsvq_lightning.splats.splats import RawSplats
 
 
 class _Project(torch.autograd.Function):
@@ -72,28 +66,26 @@ class _Blend(torch.autograd.Function):
 
 
 def render(
-    splats: SplatTensors,
+    splats: RawSplats,
     camera: Camera,
     sh_degree: int,
     background: Tensor,
-    pixel_weights: Tensor | None = None,
-    absgrad: Tensor | None = None,
-    antialiased: bool | None = None,
+    pixel_weights: Tensor | None,
+    absgrad: Tensor | None,
+    antialiased: bool | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.
     """
-    attributes = _attributes(splats)
-    with torch.cuda.device_of(attributes[0]):
-        lens = Lens.of(camera, attributes[0].device)
-        means2d, radii, ids, records, boxes = _Project.apply(lens, sh_degree, antialiased, *attributes)
+    with torch.cuda.device_of(splats.means):
+        lens = Lens.of(camera, splats.means.device)
+        means2d, radii, ids, records, boxes = _Project.apply(lens, sh_degree, antialiased, *splats)
         image, alpha, depth = _Blend.apply(lens, means2d, ids, records, boxes, background, pixel_weights, absgrad)
     return image, alpha, radii, means2d, depth
 
 
-def visible(splats: SplatTensors, camera: Camera) -> Tensor:
+def visible(splats: RawSplats, camera: Camera) -> Tensor:
     """Rows ``[V]`` int64, ascending, of the splats that can change the image."""
-    attributes = _attributes(splats)
-    with torch.cuda.device_of(attributes[0]):
-        return project_radii(Lens.of(camera, attributes[0].device), attributes).nonzero()[:, 0]
+    with torch.cuda.device_of(splats.means):
+        return project_radii(Lens.of(camera, splats.means.device), splats).nonzero()[:, 0]
