@@ -147,6 +147,12 @@ def image_axes(t, m):
 
 
 @inline
+def pixel_range(centre, half, size):
+    """First and last of ``size`` pixels whose centres are at most ``half`` from another; the last below 0 for none."""
+    return simd.maximum(simd.ceil(centre - half - 0.5), 0.0), simd.minimum(simd.floor(centre + half - 0.5), size - 1)
+
+
+@inline
 def footprint(view, screen, point, quat, log_scales, logit, antialiased):
     """Which splats can change the image, their records without the colour, their tiles and radii.
 
@@ -175,10 +181,10 @@ def footprint(view, screen, point, quat, log_scales, logit, antialiased):
         log2_opacity = log2_opacity + 0.5 * simd.log2(simd.maximum(kept, MIN_LIGHT))
     # α reaches 1/255 where u² + v² ≤ log2(255 o): a box of half sizes √(2 ln(255 o)·Σ_ii).
     reach = (log2_opacity - LOG2_ALPHA_MIN) * TWO_LN2
-    half_x, half_y = simd.sqrt(simd.maximum(reach, 0.0) * xx), simd.sqrt(simd.maximum(reach, 0.0) * yy)
-    left, right = simd.maximum(simd.ceil(px - half_x - 0.5), 0.0), simd.floor(px + half_x - 0.5)
-    top, bottom = simd.maximum(simd.ceil(py - half_y - 0.5), 0.0), simd.floor(py + half_y - 0.5)
-    right, bottom = simd.minimum(right, width - 1), simd.minimum(bottom, height - 1)
+    within = simd.maximum(reach, 0.0)
+    half_x, half_y = simd.sqrt(within * xx), simd.sqrt(within * yy)
+    left, right = pixel_range(px, half_x, width)
+    top, bottom = pixel_range(py, half_y, height)
 
     seen = (z > near) & (reach > 0) & (left <= right) & (top <= bottom)
     seen = seen & (size < LARGEST_FOOTPRINT) & (determinant < FINITE)

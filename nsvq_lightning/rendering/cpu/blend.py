@@ -238,8 +238,9 @@ def blend_tile(records, entries, begin, end, corner, size, background, grid, tou
     for block in range(BLOCKS):
         x, y = pixels_of(grid, block)
         inside = (x < columns) & (y < rows)
-        simd.store(state, T + 16 * block, simd.where(inside, 1, 0))
-        simd.store(state, T_LEFT + 16 * block, simd.where(inside, 1, 0))
+        full = simd.where(inside, 1, 0)
+        simd.store(state, T + 16 * block, full)
+        simd.store(state, T_LEFT + 16 * block, full)
         for plane in range(2, 6):
             simd.store(state, 256 * plane + 16 * block, 0)
         if simd.mask_bits(inside) != 0:
@@ -333,8 +334,8 @@ def start_block(block, corner, size, planes, gradients, pixel_weights, wanted, g
     simd.store(state, s + BACK_Y, y)
     if x0 + BLOCK_SIDE <= width and y0 + BLOCK_SIDE <= height:
         pixel = y0 * width + x0
-        red, green, blue = simd.load_block3(g_image, 3 * pixel, 3 * width)
-        rest = dot3((red, green, blue), simd.load_block3(image, 3 * pixel, 3 * width))
+        g = simd.load_block3(g_image, 3 * pixel, 3 * width)
+        rest = dot3(g, simd.load_block3(image, 3 * pixel, 3 * width))
         if with_alpha:
             kept = simd.load_block1(transmittance, pixel, width)[0]
             rest = simd.fnma(simd.load_block1(g_alpha, pixel, width)[0], kept, rest)
@@ -346,9 +347,8 @@ def start_block(block, corner, size, planes, gradients, pixel_weights, wanted, g
             simd.store(state, s + BACK_WEIGHT, simd.load_block1(pixel_weights, pixel, width)[0])
         simd.store(state, s + BACK_T, 1)
         simd.store(state, s + BACK_REST, rest)
-        simd.store(state, s + BACK_RED, red)
-        simd.store(state, s + BACK_GREEN, green)
-        simd.store(state, s + BACK_BLUE, blue)
+        for channel in range(3):
+            simd.store(state, s + BACK_RED + 16 * channel, g[channel])
         return
     for part in range(0, BACK_X, 16):
         simd.store(state, s + part, 0)

@@ -103,6 +103,13 @@ def blend_kernel(
 
 
 @triton.jit
+def store_sums(field, values):
+    """Store sums over the pixels of a tile in consecutive fields of a slot."""
+    for k in tl.static_range(len(values)):
+        tl.store(field + k, tl.sum(values[k], 0))
+
+
+@triton.jit
 def blend_backward_kernel(
     records, ranks, slots, offsets, order, ends, image, transmittance, depth, g_image, g_alpha, g_depth, pixel_weights,
     sums, columns, width, height, WITH_ALPHA: tl.constexpr, WITH_DEPTH: tl.constexpr, WITH_ABSGRAD: tl.constexpr,
@@ -141,22 +148,14 @@ def blend_backward_kernel(
             rest = tl.fma(-weight, d, rest)
             hu, hv = h * u, h * v
             slot = sums + tl.load(slots + j).to(tl.int64) * (rec.ABSGRAD_SLOT if WITH_ABSGRAD else rec.RECORD)
-            tl.store(slot + rec.SUM_RED, tl.sum(weight * g_red, 0))
-            tl.store(slot + rec.SUM_GREEN, tl.sum(weight * g_green, 0))
-            tl.store(slot + rec.SUM_BLUE, tl.sum(weight * g_blue, 0))
-            tl.store(slot + rec.SUM_H, tl.sum(h, 0))
-            tl.store(slot + rec.SUM_U, tl.sum(hu, 0))
-            tl.store(slot + rec.SUM_V, tl.sum(hv, 0))
-            tl.store(slot + rec.SUM_UU, tl.sum(hu * u, 0))
-            tl.store(slot + rec.SUM_UV, tl.sum(hu * v, 0))
-            tl.store(slot + rec.SUM_VV, tl.sum(hv * v, 0))
+            store_sums(slot + rec.SUM_RED, (weight * g_red, weight * g_green, weight * g_blue))
+            store_sums(slot + rec.SUM_H, (h, hu, hv))
+            store_sums(slot + rec.SUM_UU, (hu * u, hu * v, hv * v))
             if WITH_DEPTH:
-                tl.store(slot + rec.SUM_DEPTH, tl.sum(weight * g_far, 0))
+                store_sums(slot + rec.SUM_DEPTH, (weight * g_far,))
             if WITH_ABSGRAD:
                 along_y = tl.fma(hu, tl.load(record + rec.B), hv * tl.load(record + rec.C))
-                tl.store(slot + rec.ABS_X, tl.sum(tl.abs(hu), 0))
-                tl.store(slot + rec.ABS_Y, tl.sum(tl.abs(along_y), 0))
-                tl.store(slot + rec.SUM_WEIGHT, tl.sum(weight * strength, 0))
+                store_sums(slot + rec.ABS_X, (tl.abs(hu), tl.abs(along_y), weight * strength))
         t = after
 
 
