@@ -20,7 +20,7 @@ from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.rendering import formulas as shared
 from nsvq_lightning.rendering.cuda import records as rec
 from nsvq_lightning.rendering.cuda.binning import Tiles
-from nsvq_lightning.rendering.cuda.harmonics import load3, store3
+from nsvq_lightning.rendering.cuda.harmonics import load_row, store_row
 from nsvq_lightning.rendering.cuda.projection import Lens
 
 formulas = for_triton(shared)
@@ -46,8 +46,8 @@ def fetch(records, ranks, j, end):
     """The record at place ``j`` of the lists, before ``end``, and what α depends on: a, b, c, x, y, log2 opacity."""
     there = j < end
     record = records + tl.load(ranks + j, mask=there, other=0).to(tl.int64) * rec.RECORD
-    a, b, c = load3(record + rec.A, there)
-    px, py = tl.load(record + rec.X, mask=there, other=0.0), tl.load(record + rec.Y, mask=there, other=0.0)
+    a, b, c = load_row(record + rec.A, 3, there)
+    px, py = load_row(record + rec.X, 2, there)
     return record, a, b, c, px, py, tl.load(record + rec.LOG2_OPACITY, mask=there, other=0.0)
 
 
@@ -97,7 +97,7 @@ def blend_kernel(
     red += kept * tl.load(background)
     green += kept * tl.load(background + 1)
     blue += kept * tl.load(background + 2)
-    store3(image + 3 * pixel, (red, green, blue), inside)
+    store_row(image + 3 * pixel, (red, green, blue), inside)
     tl.store(transmittance + pixel, kept, mask=inside)
     tl.store(depth + pixel, far, mask=inside)
 
@@ -117,8 +117,8 @@ def blend_backward_kernel(
     """Write the sums of every splat of a tile to its slot."""
     tile = tl.load(order + tl.program_id(0))
     left, top, x, y, pixel, inside = tile_pixels(tile, columns, width, height)
-    g_red, g_green, g_blue = load3(g_image + 3 * pixel, inside)
-    red, green, blue = load3(image + 3 * pixel, inside)
+    g_red, g_green, g_blue = load_row(g_image + 3 * pixel, 3, inside)
+    red, green, blue = load_row(image + 3 * pixel, 3, inside)
     rest = g_red * red + g_green * green + g_blue * blue
     if WITH_ALPHA:
         # Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end.
@@ -191,14 +191,13 @@ def total_kernel(
     tl.store(totals + rank[:, None] * rec.RECORD + lane, total, mask=seen[:, None] & (lane < rec.FIELDS))
     u, v = field_of(total, rec.SUM_U), field_of(total, rec.SUM_V)
     record = records + rank * rec.RECORD
-    a, b, c = load3(record + rec.A, seen)
+    a, b, c = load_row(record + rec.A, 3, seen)
     row = tl.load(ids + rank, mask=seen, other=0)
-    tl.store(g_means2d + 2 * row, a * u * formulas.TWO_LN2, mask=seen)
-    tl.store(g_means2d + 2 * row + 1, (b * u + c * v) * formulas.TWO_LN2, mask=seen)
+    store_row(g_means2d + 2 * row, (a * u * formulas.TWO_LN2, (b * u + c * v) * formulas.TWO_LN2), seen)
     if WITH_ABSGRAD:
         x = tl.abs(a) * field_of(total, rec.ABS_X) * formulas.TWO_LN2
         y = field_of(total, rec.ABS_Y) * formulas.TWO_LN2
-        store3(absgrad + 3 * row, (x, y, field_of(total, rec.SUM_WEIGHT)), seen)
+        store_row(absgrad + 3 * row, (x, y, field_of(total, rec.SUM_WEIGHT)), seen)
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:

@@ -13,27 +13,26 @@ formulas = for_triton(shared)
 
 
 @triton.jit
-def load3(pointer, mask):
-    """Three consecutive floats at each of the pointers."""
-    a = tl.load(pointer, mask=mask, other=0.0)
-    b = tl.load(pointer + 1, mask=mask, other=0.0)
-    c = tl.load(pointer + 2, mask=mask, other=0.0)
-    return a, b, c
+def load_row(pointer, count, mask):
+    """Consecutive floats at each of the pointers."""
+    values = ()
+    for k in tl.static_range(count):
+        values += (tl.load(pointer + k, mask=mask, other=0.0),)
+    return values
 
 
 @triton.jit
-def store3(pointer, values, mask):
-    """The inverse of :func:`load3`."""
-    tl.store(pointer, values[0], mask=mask)
-    tl.store(pointer + 1, values[1], mask=mask)
-    tl.store(pointer + 2, values[2], mask=mask)
+def store_row(pointer, values, mask):
+    """The inverse of :func:`load_row`."""
+    for k in tl.static_range(len(values)):
+        tl.store(pointer + k, values[k], mask=mask)
 
 
 @triton.jit
 def add_bands(row, first, basis, rgb, mask):
     """Add coefficients from the ``first`` on, counted without the constant one, times basis values to a colour."""
     for k in tl.static_range(len(basis)):
-        r, g, b = load3(row + 3 * (first + k), mask)
+        r, g, b = load_row(row + 3 * (first + k), 3, mask)
         rgb = (rgb[0] + r * basis[k], rgb[1] + g * basis[k], rgb[2] + b * basis[k])
     return rgb
 
@@ -41,7 +40,7 @@ def add_bands(row, first, basis, rgb, mask):
 @triton.jit
 def color(first, row, d, mask, DEGREE: tl.constexpr):
     """0.5 + Σ coefficient·basis at unit direction d, before the clamp at 0."""
-    r, g, b = load3(first, mask)
+    r, g, b = load_row(first, 3, mask)
     rgb = (r * formulas.C0 + 0.5, g * formulas.C0 + 0.5, b * formulas.C0 + 0.5)
     if DEGREE > 0:
         rgb = add_bands(row, 0, formulas.bands1(d), rgb, mask)
@@ -63,8 +62,8 @@ def put_bands(rows, first, basis, rgb, masks):
     gradients = ()
     for k in tl.static_range(len(basis)):
         o = 3 * (first + k)
-        store3(g_row + o, formulas.scale3(basis[k], rgb), inside)
-        gradients += (formulas.dot3(load3(row + o, mask), rgb),)
+        store_row(g_row + o, formulas.scale3(basis[k], rgb), inside)
+        gradients += (formulas.dot3(load_row(row + o, 3, mask), rgb),)
     return gradients
 
 
@@ -75,7 +74,7 @@ def color_backward(g_first, rows, d, rgb, masks, DEGREE: tl.constexpr):
     ``rows`` are those of the higher coefficients and of their gradients, ``masks`` which coefficients are read, and
     which gradients are written: all inside the table.
     """
-    store3(g_first, formulas.scale3(formulas.C0, rgb), masks[1])
+    store_row(g_first, formulas.scale3(formulas.C0, rgb), masks[1])
     gradient = (tl.zeros_like(rgb[0]), tl.zeros_like(rgb[0]), tl.zeros_like(rgb[0]))
     if DEGREE > 0:
         gradient = formulas.direction_gradient1(put_bands(rows, 0, formulas.bands1(d), rgb, masks))

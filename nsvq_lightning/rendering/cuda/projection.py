@@ -14,7 +14,7 @@ from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.rendering import formulas as shared
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda import records as rec
-from nsvq_lightning.rendering.cuda.harmonics import color, color_backward, load3, store3
+from nsvq_lightning.rendering.cuda.harmonics import color, color_backward, load_row, store_row
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 
 formulas = for_triton(shared)
@@ -43,10 +43,7 @@ def load_view(view, fx, fy):
 @triton.jit
 def load_geometry(means, quats, scales, row, mask):
     """Mean, quaternion and log-scales of the rows."""
-    q = quats + 4 * row
-    w = tl.load(q, mask=mask, other=0.0)
-    x, y, z = load3(q + 1, mask)
-    return load3(means + 3 * row, mask), (w, x, y, z), load3(scales + 3 * row, mask)
+    return load_row(means + 3 * row, 3, mask), load_row(quats + 4 * row, 4, mask), load_row(scales + 3 * row, 3, mask)
 
 
 # Passed as the SH degree where no record is wanted.
@@ -72,22 +69,14 @@ def project_kernel(
     tl.store(radii + row, tl.where(seen, radius, 0.0).to(tl.int32), mask=inside)
     if DEGREE >= 0:
         px, py, a, b, c, log2_opacity, z, _, _ = record
-        tl.store(means2d + 2 * row, px, mask=seen)
-        tl.store(means2d + 2 * row + 1, py, mask=seen)
+        store_row(means2d + 2 * row, (px, py), seen)
         x0, y0 = tl.where(seen, first[0], 0.0).to(tl.int32), tl.where(seen, first[1], 0.0).to(tl.int32)
         x1, y1 = tl.where(seen, last[0], 0.0).to(tl.int32), tl.where(seen, last[1], 0.0).to(tl.int32)
-        box = boxes + 4 * row
-        store3(box, (x0, y0, x1 - x0 + 1), seen)
-        tl.store(box + 3, y1 - y0 + 1, mask=seen)
+        store_row(boxes + 4 * row, (x0, y0, x1 - x0 + 1, y1 - y0 + 1), seen)
         d, _ = formulas.unit_direction(row_of(view, 4), mean)
-        rgb = formulas.clamped(color(sh0 + 3 * row, shN + row * stride, d, seen, DEGREE))
-        at = records + row * rec.RECORD
-        tl.store(at + rec.X, px, mask=seen)
-        tl.store(at + rec.Y, py, mask=seen)
-        store3(at + rec.A, (a, b, c), seen)
-        tl.store(at + rec.LOG2_OPACITY, log2_opacity, mask=seen)
-        store3(at + rec.RED, rgb, seen)
-        tl.store(at + rec.DEPTH, z, mask=seen)
+        red, green, blue = formulas.clamped(color(sh0 + 3 * row, shN + row * stride, d, seen, DEGREE))
+        fields = (px, py, a, b, c, log2_opacity, red, green, blue, z)
+        store_row(records + row * rec.RECORD, fields, seen)
 
 
 @triton.jit(do_not_specialize=["n"])
@@ -108,26 +97,23 @@ def project_backward_kernel(
     camera = load_view(view, fx, fy)
     x, y, z = formulas.view_point(camera, mean)
     total, record = totals + rank * rec.RECORD, records + rank * rec.RECORD
-    g2x = tl.load(g_means2d + 2 * row, mask=seen, other=0.0)
-    g2y = tl.load(g_means2d + 2 * row + 1, mask=seen, other=0.0)
+    centre = load_row(g_means2d + 2 * row, 2, seen)
     h = tl.load(total + rec.SUM_H, mask=seen, other=0.0)
     g_mean, g_quat, g_scale = formulas.geometry_backward(
-        camera, (x, y, tl.where(seen, z, 1.0)), quat, scale, load3(record + rec.A, seen),
-        load3(total + rec.SUM_UU, seen), h, (g2x, g2y), tl.load(total + rec.SUM_DEPTH, mask=seen, other=0.0),
+        camera, (x, y, tl.where(seen, z, 1.0)), quat, scale, load_row(record + rec.A, 3, seen),
+        load_row(total + rec.SUM_UU, 3, seen), h, centre, tl.load(total + rec.SUM_DEPTH, mask=seen, other=0.0),
         ANTIALIASED,
     )  # fmt: skip
-    g_w, g_x, g_y, g_z = g_quat
-    store3(g_scales + 3 * row, g_scale, inside)
-    tl.store(g_quats + 4 * row, g_w, mask=inside)
-    store3(g_quats + 4 * row + 1, (g_x, g_y, g_z), inside)
+    store_row(g_scales + 3 * row, g_scale, inside)
+    store_row(g_quats + 4 * row, g_quat, inside)
 
-    rgb = formulas.unclamped(load3(record + rec.RED, seen), load3(total + rec.SUM_RED, seen))
+    rgb = formulas.unclamped(load_row(record + rec.RED, 3, seen), load_row(total + rec.SUM_RED, 3, seen))
     d, d_inverse = formulas.unit_direction(row_of(view, 4), mean)
     g_row = g_shN + row * STRIDE
     g_d = color_backward(g_sh0 + 3 * row, (shN + row * STRIDE, g_row), d, rgb, (seen, inside), DEGREE)
     for k in range(3 * (DEGREE + 1) * (DEGREE + 1) - 3, STRIDE):  # of the bands that are not evaluated
         tl.store(g_row + k, 0.0, mask=inside)
-    store3(g_means + 3 * row, formulas.add3(g_mean, formulas.mean_gradient(d, d_inverse, g_d)), inside)
+    store_row(g_means + 3 * row, formulas.add3(g_mean, formulas.mean_gradient(d, d_inverse, g_d)), inside)
     logit = tl.load(logits + row, mask=seen, other=0.0)
     tl.store(g_logits + row, formulas.logit_gradient(logit, h), mask=inside)
 
