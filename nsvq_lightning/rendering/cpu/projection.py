@@ -17,17 +17,11 @@ def load_screen(camera):
 
 
 @inline
-def copy_rows(array, width, start, count, scratch):
-    """Copy rows of so many floats to where whole vectors can be read."""
-    for k in range(width * count):
-        simd.put(scratch, k, simd.get(array, width * start + k))
-
-
-@inline
 def load_means(means, start, count, scratch):
     """16 means; the last, incomplete vector is read from a padded copy."""
     if count < 16:
-        copy_rows(means, 3, start, count, scratch)
+        for k in range(3 * count):
+            simd.put(scratch, k, simd.get(means, 3 * start + k))
         return simd.load_rows3(scratch, 0)
     return simd.load_rows3(means, 3 * start)
 
@@ -36,11 +30,14 @@ def load_means(means, start, count, scratch):
 def load_shapes(quats, scales, logits, start, count, scratch):
     """16 quaternions, log scales and opacity logits, an incomplete vector as in :func:`load_means`."""
     if count < 16:
-        copy_rows(quats, 4, start, count, scratch)
+        for k in range(4 * count):
+            simd.put(scratch, k, simd.get(quats, 4 * start + k))
         quat = simd.load_rows4(scratch, 0)
-        copy_rows(scales, 3, start, count, scratch)
+        for k in range(3 * count):
+            simd.put(scratch, k, simd.get(scales, 3 * start + k))
         scale = simd.load_rows3(scratch, 0)
-        copy_rows(logits, 1, start, count, scratch)
+        for k in range(count):
+            simd.put(scratch, k, simd.get(logits, start + k))
         return quat, scale, simd.load(scratch, 0)
     return simd.load_rows4(quats, 4 * start), simd.load_rows3(scales, 3 * start), simd.load(logits, start)
 
