@@ -141,8 +141,9 @@ def take_folder(trainer: Trainer) -> None:
     Raises:
         FileExistsError: It holds another run.
     """
+    folder = run_folder(trainer)  # a collective of all processes
     if trainer.is_global_zero and not is_fast_dev_run(trainer):
-        hold(run_folder(trainer))
+        hold(folder)
 
 
 def picture_file(trainer: Trainer, folder: Path, view: str) -> Path:
