@@ -8,10 +8,16 @@ import torch
 from nsvq_lightning.training.stopwatch import Stopwatch, TimesBeside
 
 
-def test_training_time_leaves_compilation_out(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Seconds on the clock, and of them those in which kernels were compiled."""
     now = [0.0, 0.0]
     monkeypatch.setattr("nsvq_lightning.training.stopwatch.time.perf_counter", lambda: now[0])
     monkeypatch.setattr("nsvq_lightning.training.stopwatch.compile_seconds", lambda: now[1])
+    return now
+
+
+def test_training_time_leaves_compilation_out(now: list[float]) -> None:
     watch = Stopwatch()
     watch.start()
     now[:] = [100.0, 93.0]
@@ -24,9 +30,7 @@ def test_training_time_leaves_compilation_out(monkeypatch: pytest.MonkeyPatch) -
     assert watch.seconds == 8.0
 
 
-def test_a_watch_that_does_not_run_counts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [0.0]
-    monkeypatch.setattr("nsvq_lightning.training.stopwatch.time.perf_counter", lambda: now[0])
+def test_a_watch_that_does_not_run_counts_nothing(now: list[float]) -> None:
     watch = Stopwatch()
     now[0] = 5.0
     watch.lap()
@@ -36,9 +40,7 @@ def test_a_watch_that_does_not_run_counts_nothing(monkeypatch: pytest.MonkeyPatc
     assert watch.seconds == 0.0
 
 
-def test_a_pause_ends_where_its_body_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [0.0]
-    monkeypatch.setattr("nsvq_lightning.training.stopwatch.time.perf_counter", lambda: now[0])
+def test_a_pause_ends_where_its_body_fails(now: list[float]) -> None:
     watch = Stopwatch()
     watch.start()
 
@@ -54,9 +56,7 @@ def test_a_pause_ends_where_its_body_fails(monkeypatch: pytest.MonkeyPatch) -> N
     assert watch.seconds == 2.0
 
 
-def test_what_is_done_twice_is_added_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [0.0]
-    monkeypatch.setattr("nsvq_lightning.training.stopwatch.time.perf_counter", lambda: now[0])
+def test_what_is_done_twice_is_added_up(now: list[float]) -> None:
     times = TimesBeside()
     for seconds in (2.0, 3.0):
         with times.timed("evaluations"):
