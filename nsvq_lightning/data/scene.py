@@ -250,6 +250,10 @@ OTHER_SHAPE = (
 )
 
 
+# With more distorted cameras than this (say, one per photo), the undistortion maps would take more than the images.
+MAX_CAMERAS_WITH_MAPS = 8
+
+
 def _image_sources(
     model: ColmapModel, paths: list[Path], masks: list[Path | None], divisor: int, max_width: int | None
 ) -> list[ImageSource]:
@@ -267,10 +271,11 @@ def _image_sources(
         log.info("%d of %d photos are turned by their EXIF orientation, as their cameras are", turned, len(heads))
     if others:
         log.warning("%d of %d photos %s", others, len(heads), OTHER_SHAPE)
+    keep_maps = len(set(kinds)) <= MAX_CAMERAS_WITH_MAPS
     lenses = {}
     for kind in dict.fromkeys(kinds):
         number, size = kind
-        full, undistortion = rectify(model.cameras[number], *size)
+        full, undistortion = rectify(model.cameras[number], *size, keep_maps=keep_maps)
         scale = 1 / divisor if max_width is None or full.width <= max_width else max_width / full.width
         lenses[kind] = undistortion, full.scaled(scale, scale)
     return [

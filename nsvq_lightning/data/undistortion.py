@@ -1,7 +1,6 @@
 """Photos of a camera with distortion, as a pinhole camera would have taken them."""
 
 import logging
-from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -14,13 +13,14 @@ from nsvq_lightning.splats.conventions import Bools, Float32s, Uint8s
 log = logging.getLogger(__name__)
 
 
-def rectify(camera: Any, width: int, height: int) -> "tuple[Pinhole, Undistortion | None]":
+def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> "tuple[Pinhole, Undistortion | None]":
     """Pinhole camera of the undistorted images, and how to undistort them (None if there is nothing to do).
 
     Args:
         camera: ``pycolmap.Camera`` of any model, or a pinhole.
         width: Width of the image files in pixels; may differ from the model's.
         height: Height of the image files in pixels.
+        keep_maps: See :class:`Undistortion`.
 
     Raises:
         SceneError: The camera cannot be turned into a pinhole camera.
@@ -31,7 +31,7 @@ def rectify(camera: Any, width: int, height: int) -> "tuple[Pinhole, Undistortio
     if (polynomial and camera.is_undistorted()) or camera.model_name in ("SIMPLE_PINHOLE", "PINHOLE"):
         pinhole = Pinhole(camera.calibration_matrix(), camera.width, camera.height)
         return pinhole.scaled(width / camera.width, height / camera.height), None
-    undistortion = Undistortion(camera, width, height)
+    undistortion = Undistortion(camera, width, height, keep_maps)
     return undistortion.pinhole, undistortion
 
 
@@ -45,12 +45,13 @@ class Undistortion:
         camera: Distorted ``pycolmap.Camera``.
         width: Width of the image files in pixels.
         height: Height of the image files in pixels.
+        keep_maps: Keep the maps, 9 bytes a pixel, for the next image of this camera.
 
     Raises:
         SceneError: The camera has no pinhole counterpart, for example a spherical one.
     """
 
-    def __init__(self, camera: Any, width: int, height: int) -> None:
+    def __init__(self, camera: Any, width: int, height: int, keep_maps: bool) -> None:
         pycolmap = import_pycolmap()
         try:
             ideal = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
@@ -64,6 +65,8 @@ class Undistortion:
         self._size = (width, height)
         self._scale = (width / camera.width, height / camera.height)
         self.pinhole = Pinhole(ideal.calibration_matrix(), ideal.width, ideal.height).scaled(*self._scale)
+        self._keep_maps = keep_maps
+        self._maps: tuple[Float32s, Float32s, Bools] | None = None
         self._warned = False
 
     def __call__(self, image: Uint8s, kept: Bools | None = None) -> tuple[Uint8s, Bools | None]:
@@ -76,7 +79,7 @@ class Undistortion:
         Returns:
             The pinhole image, and its pixels that the camera saw and whose sources count ``[H, W]``; None if all count.
         """
-        columns, rows, blank = kept_maps(self)
+        columns, rows, blank = self.maps()
         # replicate the border, so that the cubic kernel does not mix black into the edge of the crop
         result: Uint8s = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         result[blank] = 0
@@ -93,6 +96,8 @@ class Undistortion:
             Source column and row ``[H, W]``, in OpenCV's pixels (centres at integers), and which pixels the camera
             never saw.
         """
+        if self._maps is not None:
+            return self._maps
         pixels = self._source_pixels()
         # more than a pixel outside, or NaN where the ray leaves the domain of the camera model
         blank: Bools = np.any((pixels <= -1) | (pixels >= self._size) | np.isnan(pixels), axis=-1)
@@ -103,6 +108,8 @@ class Undistortion:
                 f"camera {self._camera.camera_id} ({self._camera.model_name}): {100 * blank.mean():.1f} % of the "
                 "pinhole image is left out: its field of view is too wide for a pinhole"
             )
+        if self._keep_maps:
+            self._maps = columns, rows, blank
         return columns, rows, blank
 
     def _source_pixels(self) -> Float32s:
@@ -119,7 +126,3 @@ class Undistortion:
             block = np.asarray(self._camera.img_from_cam(rays)) * self._scale - 0.5
             pixels[top : top + at_once] = block.reshape(-1, width, 2)
         return pixels
-
-
-# For the next image of a camera, 9 bytes a pixel; those of many cameras would take more than the images.
-kept_maps = lru_cache(maxsize=8)(Undistortion.maps)

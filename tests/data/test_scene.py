@@ -24,7 +24,6 @@ from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.images import ImageHead
 from nsvq_lightning.data.reconstruct import reconstruct
 from nsvq_lightning.data.scene import load_scene, usable
-from nsvq_lightning.data.undistortion import kept_maps
 from nsvq_lightning.training.module import SplatModule
 
 SceneFactory = Callable[..., Path]
@@ -392,7 +391,7 @@ def test_pixels_that_a_wide_lens_never_saw_do_not_count(make_scene: SceneFactory
     scene = load_scene(root)
     undistortion = scene.images.sources[0].undistortion
     assert undistortion is not None
-    _, _, blank = kept_maps(undistortion)
+    _, _, blank = undistortion.maps()
     blank[:4] = True
     masked, kept = scene.view(0).mask, scene.view(1).mask
     assert kept is not None

@@ -8,7 +8,7 @@ import pytest
 
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap
 from nsvq_lightning.data.scene import load_scene
-from nsvq_lightning.data.undistortion import kept_maps, rectify
+from nsvq_lightning.data.undistortion import rectify
 
 DISTORTED = {
     "SIMPLE_RADIAL": (300.0, 205.0, 148.0, -0.08),
@@ -91,13 +91,12 @@ def test_files_of_half_the_models_size() -> None:
 def test_pixels_that_the_camera_never_saw_are_black_and_told_once(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _, undistortion = rectify(_camera("OPENCV", DISTORTED["OPENCV"]), 400, 300)
+    _, undistortion = rectify(_camera("OPENCV", DISTORTED["OPENCV"]), 400, 300, keep_maps=False)
     assert undistortion is not None
     pixels = undistortion._source_pixels()
     pixels[:4] = -5  # outside the file
     monkeypatch.setattr(undistortion, "_source_pixels", lambda: pixels)
     for _ in range(2):
-        kept_maps.cache_clear()
         image, count = undistortion(np.full((300, 400, 3), 255, np.uint8))
         assert count is not None
         assert not count[:4].any()
