@@ -84,6 +84,16 @@ def positive(kind: type[int] | type[float]) -> Callable[[str], int | float]:
     return parse
 
 
+def add_root(parser: argparse.ArgumentParser, use: str) -> None:
+    """Add ``--data.root``, a scene folder.
+
+    Args:
+        parser: That of a command.
+        use: What the folder is for, as the help says it.
+    """
+    parser.add_argument("--data.root", dest="root", type=Path, metavar="FOLDER", help=use)
+
+
 def scene_file(path: Path) -> Path:
     """The scene file that is meant.
 

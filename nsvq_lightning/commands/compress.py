@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import positive, views_of
+from nsvq_lightning.commands.arguments import add_root, positive, views_of
 from nsvq_lightning.io.atomic import write_bytes
 from nsvq_lightning.io.formats import FORMATS
 from nsvq_lightning.io.lod import NAME
@@ -80,8 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     aim("--levels", type=positive(int), metavar="N", help=help_)
     add("--level", choices=LEVELS, default=DEFAULT_LEVEL, help="%(default)s by default")
     add("--seed", type=int, default=0, help="seed of all draws")
-    help_ = "scene folder with the photos: splats and codebooks are fitted to its train photos"
-    add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
+    add_root(parser, "scene folder with the photos: splats and codebooks are fitted to its train photos")
     help_ = "steps of a training; 500, or 1500 with fewer splats, if they fit into --minutes"
     add("--steps", type=positive(int), metavar="N", help=help_)
     help_ = "what one training may take, about; %(default)g by default"

@@ -21,7 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import views_of
+from nsvq_lightning.commands.arguments import add_root, views_of
 from nsvq_lightning.commands.compress import VIEWS, share_or_number, splats_left, written_error
 from nsvq_lightning.io import formats, lod, placing, spz
 from nsvq_lightning.io.compressed import CompressedScene, attribute_errors
@@ -46,8 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--measure", action="store_true", help="render both files and say how they differ")
     help_ = "keep the splats with centres in this box, in scene units of the input"
     add("--crop", nargs=6, type=float, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"), help=help_)
-    help_ = "remove splats that no photo of --data.root supports; takes minutes"
-    add("--floaters", action="store_true", help=help_)
+    add("--floaters", action="store_true", help="remove splats that no photo of --data.root supports; takes minutes")
     help_ = "keep so many splats, or this share of them: those that contribute most to its pictures"
     add("--splats", type=share_or_number, metavar="N", help=help_)
     add("--sh-degree", type=int, choices=range(4), help="keep spherical harmonics up to this degree")
@@ -59,8 +58,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     help_ = "move the scene so that the cameras of --data.root are where those of this scene folder are, by photo name"
     turn("--align", type=Path, metavar="FOLDER", help=help_)
     add("--up-from", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where up is in the input, for --up")
-    help_ = "scene folder: for --floaters, --up and --align; for --measure and --splats instead of the scene's pictures"
-    add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
+    add_root(
+        parser,
+        "scene folder: for --floaters, --up and --align; for --measure and --splats instead of the scene's pictures",
+    )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import cameras_of, positive, scene_file
+from nsvq_lightning.commands.arguments import add_root, cameras_of, positive, scene_file
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
@@ -40,8 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("scene", type=Path, metavar="SCENE", help="file of any format that convert reads, or the folder of a run")
     help_ = ".mp4 file, or a folder for PNGs; by default render.mp4 beside the scene"
     add("-o", "--output", type=Path, metavar="OUT", help=help_)
-    help_ = "folder of the photos, whose cameras the path follows; that of the run by default"
-    add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
+    add_root(parser, "folder of the photos, whose cameras the path follows; that of the run by default")
     add("--path", help="through, cameras, orbit or a .json; through by default, orbit without photos")
     add("--size", type=_size, metavar="WxH", help="pixels; those of the cameras by default")
     length = parser.add_mutually_exclusive_group().add_argument
@@ -124,8 +123,9 @@ def _path(options: argparse.Namespace, splats: "Splats", is_video: bool) -> "tup
         fps = options.fps or own
     elif not cameras:
         if kind != "orbit":
-            message = f"--path {kind} needs the cameras of photos: name their folder with --data.root, or take orbit"
-            raise ValueError(message)
+            raise ValueError(
+                f"--path {kind} needs the cameras of photos: name their folder with --data.root, or take orbit"
+            )
         log.info("no photos: their cameras are guessed from the scene; --data.root names the folder of the photos")
         cameras = likely_cameras(splats, 24)
     width, height = options.size or (cameras[0].width, cameras[0].height)

@@ -55,8 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--configs", **listed, metavar="A,B", help="files or shipped names, as for nsvq fit --config")
     add("--quantizers", **listed, metavar="A,B", help="classes, as for nsvq fit --model.quantizer")
     add("--codebooks", **listed, metavar="1k,4k", help="sizes, for configurations that have codebooks")
-    help_ = "of the draws and of the order of the views"
-    add("--seeds", type=integers, default=("",), metavar="0,1,2", help=help_)
+    add("--seeds", type=integers, default=("",), metavar="0,1,2", help="of the draws and of the order of the views")
     add("--max-steps", type=int, metavar="N", help="iterations of every run (default: those of its configuration)")
     parser.add_argument("--keep-checkpoints", action="store_true", help="keep those of finished runs")
     help_ = "only print a command for each unfinished run, to be run anywhere"

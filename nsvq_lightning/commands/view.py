@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import cameras_of, scene_file
+from nsvq_lightning.commands.arguments import add_root, cameras_of, scene_file
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
@@ -33,12 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("scene", type=Path, metavar="SCENE", help="file of any format that convert reads, or the folder of a run")
     add("--live", action="store_true", help="follow a fit that is running, given its folder")
-    help_ = "folder of the photos, whose cameras are offered; that of the run by default"
-    add("--data.root", dest="root", type=Path, metavar="FOLDER", help=help_)
+    add_root(parser, "folder of the photos, whose cameras are offered; that of the run by default")
     add("-o", "--output", type=Path, metavar="OUT.html", help="write one page with the scene instead")
     add("--port", type=_port, default=7007, help="%(default)s by default; 0 for any that is free")
-    help_ = "127.0.0.1, this machine only, by default; 0.0.0.0 for all of the network"
-    add("--host", default="127.0.0.1", help=help_)
+    add("--host", default="127.0.0.1", help="127.0.0.1, this machine only, by default; 0.0.0.0 for all of the network")
     add("--no-open", dest="open", action="store_false", help="do not open the browser")
 
 
@@ -59,8 +57,9 @@ def run(options: argparse.Namespace) -> int:
     from nsvq_lightning.report.viewer import LIVE_SCENE, viewer_page, write_viewer
 
     if options.live and (options.output is not None or not options.scene.is_dir()):
-        message = "--live follows a fit that is running: give the folder of the run, and no --output"
-        raise argparse.ArgumentError(None, message)
+        raise argparse.ArgumentError(
+            None, "--live follows a fit that is running: give the folder of the run, and no --output"
+        )
     path = options.scene.resolve()
     title = f"{path.parent.name} / {path.name}" if path.is_dir() else path.name
     with _nsvq_file(options) as file:

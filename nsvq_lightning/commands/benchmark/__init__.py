@@ -49,8 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--init-from", type=Path, metavar="FILE", help=help_)
     add("--config", metavar="NAME", help="config of the runs of train (fast.yaml, without photos demo.yaml)")
     add("--steps", type=positive(int), metavar="N", help="iterations of each run of train (1000; quick 40)")
-    help_ = "switches that train inverts one by one, or all"
-    add("--switches", type=some_of(SKIPS), metavar="NAME,NAME", help=help_)
+    add("--switches", type=some_of(SKIPS), metavar="NAME,NAME", help="switches that train inverts one by one, or all")
     add = parser.add_argument_group("how much").add_argument
     add("--quick", action="store_true", help="small workloads, few repeats: all within a minute")
     add("--repeats", type=positive(int), metavar="N", help="timed calls of each case (15; quick 3)")
@@ -73,8 +72,9 @@ def run(options: argparse.Namespace) -> int:
     if steps is not None and steps < 4:
         raise argparse.ArgumentError(None, f"--steps must be at least 4, one for each phase, got {steps}")
     if options.init_from is not None and not (scene is not None and scene.is_dir()):
-        message = "--init-from needs a COLMAP folder as --scene, whose cameras look at its splats"
-        raise argparse.ArgumentError(None, message)
+        raise argparse.ArgumentError(
+            None, "--init-from needs a COLMAP folder as --scene, whose cameras look at its splats"
+        )
     from nsvq_lightning.commands.benchmark.timing import Scope, as_markdown, describe_machine
     from nsvq_lightning.data.scene import load_scene
     from nsvq_lightning.io.formats import read_scene
