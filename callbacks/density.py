@@ -147,7 +147,7 @@ class Densification(SplatCallback, ABC):
             How many splats there are more.
         """
         splats, optimizer, before = module.splats, trainer.optimizers[0], len(module.splats)
-        row_ops.append_rows(splats, optimizer, new._asdict())
+        row_ops.append_rows(splats, optimizer, new)
         row_ops.keep_rows(splats, optimizer, torch.cat([~divided, divided.new_ones(len(splats) - before)]))
         for name in self.tables:
             splats.add_table(name).zero_()

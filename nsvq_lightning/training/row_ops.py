@@ -6,14 +6,14 @@ the optimiser. The step count of Adam belongs to the parameter, not to a row, an
 """
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nsvq_lightning.splats.attributes import ATTRIBUTES, dropped, finite_rows, listed
-from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.splats.attributes import dropped, finite_rows, listed
+from nsvq_lightning.splats.splats import RawSplats, Splats, check_shapes
 from nsvq_lightning.training.optim import find_group
 
 log = logging.getLogger(__name__)
@@ -27,23 +27,19 @@ FIRST_MOMENT = "exp_avg"
 MOMENTS = (FIRST_MOMENT, "exp_avg_sq", "max_exp_avg_sq")
 
 
-def append_rows(splats: Splats, optimizer: Optimizer, new: Mapping[str, Tensor]) -> None:
+def append_rows(splats: Splats, optimizer: Optimizer, new: RawSplats) -> None:
     """Add splats at the end; their Adam moments and side tables start at zero.
 
     Args:
         splats: The ``N`` splats to extend.
         optimizer: Optimiser with one group per attribute, named after it.
-        new: Raw attributes ``[M, ...]`` by name, all six, see :class:`Splats`.
+        new: Raw attributes of the ``M`` new ones.
 
     Raises:
-        ValueError: An attribute is missing or has another number of rows.
+        ValueError: The shapes of the attributes do not fit each other.
     """
-    if set(new) != set(ATTRIBUTES):
-        raise ValueError(f"new splats need the attributes {', '.join(ATTRIBUTES)}, got {', '.join(sorted(new))}")
-    counts = {name: tensor.shape[0] for name, tensor in new.items()}
-    if len(set(counts.values())) > 1:
-        raise ValueError(f"all attributes of the new splats must have the same number of rows, got {counts}")
-    count = counts["means"]
+    check_shapes(new._asdict())
+    count = len(new.means)
     if count == 0:
         return
 
@@ -51,7 +47,7 @@ def append_rows(splats: Splats, optimizer: Optimizer, new: Mapping[str, Tensor])
         return torch.cat([moment, moment.new_zeros(count, *moment.shape[1:])])
 
     for name, parameter in splats.attributes().items():
-        values = torch.cat([parameter.detach(), new[name].to(parameter)])
+        values = torch.cat([parameter.detach(), getattr(new, name).to(parameter)])
         _rebind(splats, optimizer, name, values, extend_with_zeros)
     _edit_tables(splats, extend_with_zeros)
 
@@ -107,19 +103,21 @@ def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: 
     if maps.shape != (*values.shape, values.shape[-1]):
         raise ValueError(f"maps of {name} must be {[*values.shape, values.shape[-1]]}, got {list(maps.shape)}")
     replace_attribute(splats, optimizer, name, values)
-    state = optimizer.state.get(find_group(optimizer, name)["params"][0], {})
-    for key in MOMENTS:
-        if key in state:
-            factors = maps if key == FIRST_MOMENT else maps.square()
-            state[key] = (factors * state[key][:, None, :]).sum(2)
+    for key, moment in _moments(optimizer, name).items():
+        factors = maps if key == FIRST_MOMENT else maps.square()
+        moment.copy_((factors * moment[:, None, :]).sum(2))
 
 
 def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -> None:
     """Set the Adam moments of the group ``name`` to zero, for all rows or for ``rows`` (indices or a mask)."""
+    for moment in _moments(optimizer, name).values():
+        moment[slice(None) if rows is None else rows] = 0.0
+
+
+def _moments(optimizer: Optimizer, name: str) -> dict[str, Tensor]:
+    """Adam's moments of the group ``name``, which it has once it has been stepped."""
     state = optimizer.state.get(find_group(optimizer, name)["params"][0], {})
-    for key in MOMENTS:
-        if key in state:
-            state[key][slice(None) if rows is None else rows] = 0.0
+    return {key: state[key] for key in MOMENTS if key in state}
 
 
 def trainable_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:

@@ -82,7 +82,7 @@ def swap_first(stage: Stage) -> None:
     """Remove the first splat and add one at the end."""
     splats, optimizer = stage.module.splats, stage.trainer.optimizers[0]
     keep_rows(splats, optimizer, torch.arange(len(splats)) > 0)
-    append_rows(splats, optimizer, {name: value.detach()[:1] for name, value in splats.attributes().items()})
+    append_rows(splats, optimizer, RawSplats(*(value.detach()[:1] for value in splats.raw())))
 
 
 @pytest.mark.parametrize("edit", ["removed", "added", "swapped"])

@@ -24,7 +24,7 @@ from nsvq_lightning.callbacks.base import keep_finite_splats
 from nsvq_lightning.callbacks.quantization import perplexity
 from nsvq_lightning.quantize import NSVQ, StraightThrough
 from nsvq_lightning.random import generator
-from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training import distributed
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.training.row_ops import append_rows, keep_rows
@@ -190,7 +190,7 @@ class Stage:
         keep_rows(self.splats, self.optimizer, torch.arange(len(self.splats)) > 0)
 
     def append_last(self) -> None:
-        rows = {name: value.detach()[-1:] for name, value in self.splats.attributes().items()}
+        rows = RawSplats(*(value.detach()[-1:] for value in self.splats.raw()))
         append_rows(self.splats, self.optimizer, rows)
 
 

@@ -61,7 +61,7 @@ def test_an_appended_splat_starts_without_moments_and_the_others_keep_theirs() -
     splats, other = make(4), make(2, seed=1)
     optimizer = trained(splats, 2)
     before = {name: {k: v.clone() for k, v in state_of(splats, optimizer, name).items()} for name in ATTRIBUTES}
-    append_rows(splats, optimizer, other.raw()._asdict())
+    append_rows(splats, optimizer, other.raw())
     assert len(splats) == 6
     for name in ATTRIBUTES:
         state = state_of(splats, optimizer, name)
@@ -89,7 +89,7 @@ def test_side_tables_follow_the_rows() -> None:
     optimizer = trained(splats, 1)
     splats.add_table("score").copy_(torch.arange(4.0))
     keep_rows(splats, optimizer, torch.tensor([False, True, True, True]))
-    append_rows(splats, optimizer, make(2).raw()._asdict())
+    append_rows(splats, optimizer, make(2).raw())
     assert splats.tables()["score"].tolist() == [1.0, 2.0, 3.0, 0.0, 0.0]
     assert splats.state_dict()["score"].tolist() == [1.0, 2.0, 3.0, 0.0, 0.0]
 
@@ -175,10 +175,8 @@ def test_wrong_edits_are_refused() -> None:
     optimizer = trained(splats, 1)
     with pytest.raises(ValueError, match=r"mask must be \[3\] bool"):
         keep_rows(splats, optimizer, torch.ones(4, dtype=torch.bool))
-    with pytest.raises(ValueError, match="need the attributes"):
-        append_rows(splats, optimizer, {"means": torch.zeros(1, 3)})
-    uneven = make(2).raw()._asdict() | {"means": torch.zeros(1, 3)}
-    with pytest.raises(ValueError, match="same number of rows"):
+    uneven = make(2).raw()._replace(means=torch.zeros(1, 3))
+    with pytest.raises(ValueError, match=r"quats must have shape \[1, 4\]"):
         append_rows(splats, optimizer, uneven)
     with pytest.raises(ValueError, match="must keep its shape"):
         replace_attribute(splats, optimizer, "opacities", torch.zeros(4))

@@ -10,6 +10,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import Recipe, RunFactory, paper_phases
 
+from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.row_ops import append_rows, keep_rows
 
 STEPS = 60
@@ -32,7 +33,7 @@ class EditRows(Callback):
         self.edits += 1
         if self.kind == "swap":
             keep_rows(splats, optimizer, torch.arange(len(splats)) >= AMOUNT)
-        append_rows(splats, optimizer, {n: value.detach()[-AMOUNT:] for n, value in splats.attributes().items()})
+        append_rows(splats, optimizer, RawSplats(*(value.detach()[-AMOUNT:] for value in splats.raw())))
 
 
 @pytest.mark.parametrize(("kind", "place"), [("swap", "first"), ("add", "last")])
