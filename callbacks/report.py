@@ -148,9 +148,7 @@ class MetricReport(WritingCallback):
                 with optional(folder / "preview.png"):
                     pictures.write_png(folder / "preview.png", torch.cat([eight_bit(photo), image], dim=1))
 
-        mean_psnr, mean_ssim = numbers.evaluate(
-            lambda camera: module.scene.render(splats, camera).image, views, module.device, show
-        )
+        mean_psnr, mean_ssim = numbers.evaluate(module.scene.render, splats, views, show)
         entry: dict[str, Any] = {
             "iteration": iteration,
             "phase": phase.name.lower(),

@@ -167,7 +167,7 @@ def _up(options: argparse.Namespace) -> Float64s:
     length = float(np.linalg.norm(up))
     if not 0 < length < np.inf:
         raise ValueError(f"--up-from {' '.join(map(str, options.up_from))} is no direction")
-    return np.asarray(up / length)
+    return up / length
 
 
 def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
@@ -187,7 +187,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
 
     def psnr(keep: torch.Tensor) -> float:
         kept = type(splats)(*(tensor[keep] for tensor in splats))
-        return evaluate(lambda camera: look(kept, camera).image, map(photos.view, photos.test), splats.means.device)[0]
+        return evaluate(look, kept, map(photos.view, photos.test))[0]
 
     removed = floaters(splats, views, look)
     before, after = psnr(torch.ones_like(removed)), psnr(~removed)

@@ -12,6 +12,7 @@ import torch
 import torch.distributed
 from torch import Tensor
 
+from nsvq_lightning.compression.importance import Renderer
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.compressed import CompressedScene
@@ -20,8 +21,8 @@ from nsvq_lightning.io.nsvq.header import read_header
 from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import eight_bit, psnr
-from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats.conventions import Integers
+from nsvq_lightning.splats.splats import SplatTensors
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -31,26 +32,26 @@ Rows = Sequence[Values]
 
 @torch.no_grad()
 def evaluate(
-    render_image: Callable[[Camera], Tensor],
+    render: Renderer,
+    splats: SplatTensors,
     views: Iterable[View],
-    device: torch.device,
     show: Callable[[Tensor, Tensor], None] | None = None,
 ) -> tuple[float, float]:
     """Mean PSNR, dB, and SSIM of rendered views against their photos, over the views of all processes.
 
     Args:
-        render_image: Image ``[H, W, 3]`` of a camera.
+        render: The rasterizer.
+        splats: Raw attributes of what it renders.
         views: What to compare with.
-        device: Where the splats are.
         show: Called with the first image and its photo.
 
     Raises:
         ValueError: There are no views.
     """
-    sums = torch.zeros(3, dtype=torch.float64, device=device)  # of PSNR, of SSIM, and of views
+    sums = splats.means.new_zeros(3, dtype=torch.float64)  # of PSNR, of SSIM, and of views
     for view in views:
-        view = view.to(device)
-        image = apply_mask(render_image(view.camera), view.mask)
+        view = view.to(sums.device)
+        image = apply_mask(render(splats, view.camera).image, view.mask)
         if show is not None:
             show(image, view.image)
             show = None

@@ -180,11 +180,7 @@ def run(scope: Scope) -> Iterator[Measurement]:
 def _test_psnr(module: SplatModule) -> float:
     data: ColmapDataModule = module.trainer.datamodule  # type: ignore[attr-defined]  # Lightning does not type it
     splats = module.scene.hard_splats(module.phase)
-    psnr, _ = evaluate(
-        lambda camera: module.scene.render(splats, camera).image,
-        data.test_dataloader(),
-        module.device,
-    )
+    psnr, _ = evaluate(module.scene.render, splats, data.test_dataloader())
     return psnr
 
 
