@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated
 
@@ -12,7 +12,7 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.compression.importance import most_contributing
-from nsvq_lightning.data.images import ImageStore, edges_of
+from nsvq_lightning.data.images import edges_of
 from nsvq_lightning.data.scene import View, detailed_pixels
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.random import draw_rows, generator
@@ -182,7 +182,6 @@ class BudgetedGrowth(Densification):
     state = ("idle",)
     idle = 0
     """How many times in a row hardly a splat had to be split."""
-    _photos: ImageStore | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -209,11 +208,6 @@ class BudgetedGrowth(Densification):
         grows = round(first + (most - first) * 2 / 3)  # along the root of the time
         return [(full, grows), (warmup - full, most), (1 - warmup, budget)]
 
-    def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
-        """Find the photos of the scene, which know their edges."""
-        scene = run_scene.scene_of(trainer)
-        self._photos = None if scene is None else scene.images
-
     def limit(self, module: SplatModule) -> int:
         """How many splats growth may reach.
 
@@ -233,8 +227,8 @@ class BudgetedGrowth(Densification):
         growing = module.schedule.phase_at(iteration) is Phase.WARMUP
         module.pixel_weights = None
         if growing:
-            known = self._photos
-            edges = edges_of(batch.image, batch.mask) if known is None else known.edges(batch.index)
+            scene = run_scene.scene_of(module.trainer)
+            edges = edges_of(batch.image, batch.mask) if scene is None else scene.images.edges(batch.index)
             module.pixel_weights = edges.strength(batch.image.device)
         return growing
 

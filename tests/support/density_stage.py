@@ -46,6 +46,7 @@ class Stage:
             world_size=1,
             accumulate_grad_batches=micro,
         )
+        self.module.trainer = self.trainer
 
     def start_batch(self, iteration: int, batch: Any = None) -> None:
         self.trainer.global_step = iteration - 1
