@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nsvq_lightning.training import self_check
-from nsvq_lightning.training.self_check import TOLERANCE, check_kernels, kernel_errors
+from nsvq_lightning.training.self_check import TOLERANCE, check_kernels, kernel_errors, relative_l2
 from nsvq_lightning.version import __version__
 
 
@@ -16,6 +16,11 @@ def test_the_kernels_of_the_cpu_are_right() -> None:
     errors = kernel_errors("cpu")["cpu"]
     assert {"image", "loss", "means", "shN", "codes", "noise", "codebook"} <= set(errors)
     assert max(errors.values()) < 1e-4
+
+
+def test_errors_are_relative() -> None:
+    assert relative_l2(torch.tensor([3.0, 4.4]), torch.tensor([3.0, 4.0])) == pytest.approx(0.08)
+    assert relative_l2(torch.tensor([3.0, 4.0]), torch.zeros(2)) == 5
 
 
 @pytest.mark.parametrize("error", [2 * TOLERANCE, float("nan"), 1e-6])

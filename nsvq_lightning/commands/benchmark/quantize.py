@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.commands.benchmark.timing import Measurement, Scope, compare
-from nsvq_lightning.commands.benchmark.workloads import relative_l2, workloads
+from nsvq_lightning.commands.benchmark.workloads import workloads
 from nsvq_lightning.quantize import NSVQ, CodebookQuantizer, nearest, nearest_reference
 from nsvq_lightning.quantize.attributes import attribute_rows, build_quantizers
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.optim import LearningRates
+from nsvq_lightning.training.self_check import relative_l2
 
 STEP = "step, forward + backward"
 SEARCH = "search"
@@ -98,7 +99,7 @@ Quantize = Callable[[CodebookQuantizer, Tensor, torch.Generator, Tensor], tuple[
 
 def step(attributes: Mapping[str, Attribute], turn: int, quantize: Quantize = CodebookQuantizer.__call__) -> Results:
     """One forward and backward pass, by default of the quantizers of the package."""
-    results: Results = {}
+    results = {}
     for name, (quantizer, x, rows, upstream) in attributes.items():
         quantized, codes = quantize(quantizer, x, generator(0, turn, "noise", name), rows)
         gradient, _ = torch.autograd.grad(quantized, (x, quantizer.codebook), upstream)

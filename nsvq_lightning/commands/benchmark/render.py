@@ -13,12 +13,13 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.commands.benchmark.timing import Measurement, Scope, compare
-from nsvq_lightning.commands.benchmark.workloads import Workload, relative_l2, workloads
+from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.compute.devices import devices_with_kernels, fast_backends
 from nsvq_lightning.quality.loss import photometric_loss, plain_loss
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.training.self_check import relative_l2
 
 FORWARD = "forward"
 BOTH = "forward + backward"

@@ -64,14 +64,6 @@ class Workload:
         return f"{self.name} {self.camera.width}x{self.camera.height}"
 
 
-def relative_l2(value: Tensor, truth: Tensor) -> float:
-    """‖value − truth‖ / ‖truth‖ in float64; the plain ‖value‖ where the truth is 0."""
-    truth = truth.detach().double()
-    distance = torch.linalg.vector_norm(value.detach().double() - truth)
-    scale = torch.linalg.vector_norm(truth)
-    return float(distance / scale if scale > 0 else distance)
-
-
 def workloads(scope: Scope) -> list[Workload]:
     """The scene that the user gives, or the synthetic scenes that the scope names.
 

@@ -7,7 +7,7 @@ import torch
 
 from nsvq_lightning import save
 from nsvq_lightning.commands.benchmark.timing import Scope
-from nsvq_lightning.commands.benchmark.workloads import relative_l2, synthetic_workload, workloads
+from nsvq_lightning.commands.benchmark.workloads import synthetic_workload, workloads
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import CompressedScene, write_ply
 from nsvq_lightning.rendering.rasterize import render
@@ -57,8 +57,3 @@ def test_folder_is_seen_by_its_first_train_camera(demo_scene: Path) -> None:
     (workload,) = workloads(Scope(scene=demo_scene))
     assert torch.equal(workload.camera.viewmat, scene.cameras[scene.train[0]].viewmat)
     assert torch.equal(workload.splats.means, scene.points)
-
-
-def test_errors_are_relative() -> None:
-    assert relative_l2(torch.tensor([3.0, 4.4]), torch.tensor([3.0, 4.0])) == pytest.approx(0.08)
-    assert relative_l2(torch.tensor([3.0, 4.0]), torch.zeros(2)) == 5
