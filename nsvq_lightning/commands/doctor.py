@@ -323,7 +323,7 @@ def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
 
 def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     """Decode all photos, in parallel: whether that works, how much masks exclude, and which are not in the model."""
-    from nsvq_lightning.data.photo_files import PHOTOS
+    from nsvq_lightning.data.photo_files import photos_below
     from nsvq_lightning.data.scene import each_photo
 
     # Share of the pixels that count, or what is wrong.
@@ -345,8 +345,8 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     folder = scene.root / (model.images_folder or "images")
     if folder == scene.root:
         return  # that of a NeRF-synthetic scene, which also holds maps and further views
-    files = {path for path in folder.rglob("*") if path.suffix.lower() in PHOTOS}
-    extra = files.difference(source.path for source in scene.images.sources)
+    files = photos_below(folder)
+    extra = set(files).difference(source.path for source in scene.images.sources)
     if extra:
         text = f"{len(extra)} of {len(files)} files in {folder} are not in the model"
         advice = "they are not used; if many, photos lack overlap or sharpness"

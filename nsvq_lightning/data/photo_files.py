@@ -37,7 +37,7 @@ def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool 
     if len(exact) == len(paths):
         return paths
     taken = {paths[name] for name in exact}
-    free = [path for path in _photos_in(folder) if path not in taken]
+    free = [path for path in photos_below(folder) if path not in taken]
     files = _Files(folder, free, whole=bool(exact))
     used: dict[Path, str] = {}
     for name in sorted(paths.keys() - exact):
@@ -111,7 +111,7 @@ def _kind(name: str) -> str:
     return name.lower().rpartition(".")[2].replace("jpeg", "jpg").replace("tiff", "tif")
 
 
-def _photos_in(folder: Path) -> list[Path]:
+def photos_below(folder: Path) -> list[Path]:
     """The files in a folder and the folders in it that end as photos do, sorted."""
     return sorted(path for path in folder.rglob("*") if path.suffix.lower() in PHOTOS and path.is_file())
 
@@ -203,7 +203,7 @@ _MASK_NAMES = ("{}_mask", "{}.mask", "mask_{}")
 
 def _masks_in(folder: Path, named: Sequence[tuple[str, str]], beside: bool) -> list[Path | None]:
     """The masks in a folder of photos by either name; ``beside`` the photos, none has the name of its photo."""
-    files = _Files(folder, _photos_in(folder))
+    files = _Files(folder, photos_below(folder))
     found: list[Path | None] = []
     for names in named:
         wanted = [f"{name}.png" for name in names]
