@@ -180,7 +180,7 @@ class CodebookReplacement(SplatCallback):
             return
         if self.jitter is not None:
             keep_finite_splats(trainer, module)
-        values: dict[str, float] = {}
+        values = {}
         for name, quantizer in module.quantizers.items():
             _sum_usage(trainer, quantizer)
             values[f"codebook/{name}_perplexity"] = perplexity(quantizer.usage)
@@ -194,7 +194,7 @@ class CodebookReplacement(SplatCallback):
                 row_ops.reset_moments(trainer.optimizers[0], optim.codebook_group(name), replaced)
             log.debug("iteration %d: replaced %d codes of %s", iteration, len(replaced), name)
         distributed.check_replicas(trainer, "the replacement of codes")
-        module.log_dict(dict(values), batch_size=1)
+        module.log_dict(values, batch_size=1)
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Keep a checkpoint's counts on the first process only: they are the sum of all."""

@@ -206,7 +206,7 @@ class Compressor:
         Raises:
             ValueError: None was found.
         """
-        best: Candidate | None = None
+        best = None
         asked = float(target)
         for _ in range(ESTIMATES):
             setting = setting_for(int(asked), splats, self.scene.sh_degree)
@@ -293,7 +293,7 @@ class Compressor:
         steps = max(4, self.steps or self.usual_steps(setting.splats))
         prune = steps // 4 if setting.splats < len(self.scene) else 0
         module = SplatModule(
-            splats=Splats.from_tensors(*(tensor.clone() for tensor in self._splats)),
+            splats=Splats.from_tensors(*self._splats),
             codebooks=sizes or None,
             # A trained scene is in its place; what is left of some splats moves into that of the others.
             rates=LearningRates(means=4e-5 if prune else LearningRates.means_final),

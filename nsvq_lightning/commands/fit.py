@@ -183,7 +183,7 @@ class SplatCLI(LightningCLI):
         """
         subcommand = self.config.subcommand
         path = self.config[subcommand].get("ckpt_path")
-        settings: dict[str, Any] = {}
+        settings = {}
         if path is not None:
             # Words that Lightning accepts instead of a path; ``last`` and ``best`` refer to its own callback.
             remote = path.partition(":")[0] in ("hpc", "registry") or "://" in path

@@ -101,7 +101,7 @@ def in_plain_words(message: str, arguments: Iterable[str]) -> str:
         return f"{name}: {' '.join(problem[0].split())}{meant}"
     types = re.search(r"Subtypes: .*", message) or re.search(r"Expected a .*", message)
     kinds = r"Literal\[(.*?)\]|(?:<class '(?:[\w.]*\.)?|Annotated\[)(\w+)"
-    allowed: list[str] = []
+    allowed = []
     for literal, kind in re.findall(kinds, types[0] if types else ""):
         if literal:
             allowed += [each.strip("'") for each in literal.split(", ")]

@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> int:
     images = scene / "images"
     in_place = source.resolve() == images.resolve()
     _claim(options, is_video, in_place)
-    bars: dict[str, tqdm] = {}
+    bars = {}
 
     def report(step: str, done: int, total: int) -> None:
         if step not in bars:

@@ -54,7 +54,7 @@ def expand(arguments: Sequence[str]) -> list[str]:
         ValueError: Two shorthands are given, of which only one can hold, or one without its number.
     """
     expanded = []
-    size: str | None = None  # the shorthand that says how large the scene is to be
+    size = None  # the shorthand that says how large the scene is to be
     for argument in joined(arguments):
         option, _, value = argument.partition("=")
         name = option.removeprefix("--")
@@ -226,7 +226,7 @@ def limit_aliases() -> None:
     """Let the parser refuse what aliases make too large, in files that a config names and in its texts, too."""
     from jsonargparse._loaders_dumpers import get_yaml_default_loader  # all of its ways to read YAML use this class
 
-    loader: Any = get_yaml_default_loader()  # type: ignore[no-untyped-call]
+    loader = get_yaml_default_loader()  # type: ignore[no-untyped-call]
     compose = loader.get_single_node
     loader.get_single_node = lambda self: _limited(compose(self))
 

@@ -273,7 +273,7 @@ class ImageSource:
         if pixels.ndim != 3 or pixels.shape[2] != 4:
             raise _undecodable(self.path, f"its transparency is not understood, its pixels are {pixels.shape[2:]}")
         pixels = _turned_back(pixels, undo)
-        image: Uint8s = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB)
+        image = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB)
         alpha = pixels[..., 3]
         if not self.white:
             return image, alpha >= 128  # half opaque

@@ -176,7 +176,7 @@ def _extract(
     """Find features in photos that have none yet; returns the stamp of each photo."""
     pycolmap = import_pycolmap()
     images = scene / "images"
-    groups: defaultdict[Any, list[str]] = defaultdict(list)
+    groups = defaultdict(list)
     for name, head in photos.items():
         path = images / name
         groups[path.parent, head.size, _lens_of(path)].append(name)
@@ -307,7 +307,7 @@ def _map(scene: Path, stamps: dict[str, str], report: Report, threads: int) -> l
 
 def _adding(models: Iterable[Any]) -> list[Any]:
     """The largest model, and those with photos that no larger one has; COLMAP also leaves parts of larger ones."""
-    adding: list[Any] = []
+    adding = []
     placed: set[str] = set()
     for model in sorted(models, key=lambda model: -model.num_reg_images()):
         names = _registered(model)
@@ -360,7 +360,7 @@ def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
     files = [path for path in folder.rglob("[!.]*") if path.suffix.lower() in suffixes and path.is_file()]
     files.sort(key=lambda path: (path.parent != folder, suffixes.index(path.suffix.lower()), path))
     taken: dict[str, Path] = {}
-    left: LeftOut = defaultdict(list)
+    left = defaultdict(list)
     for path in files:
         inside = path.relative_to(folder)
         if any((folder / parent / RECORD).is_file() for parent in inside.parents[:-1]):
@@ -393,8 +393,8 @@ def copy_photos(photos: Sequence[Path], source: Path, folder: Path, report: Repo
     Returns:
         The names of the copies in ``folder``, and which photos cannot be read.
     """
-    names: list[str] = []
-    left: LeftOut = defaultdict(list)
+    names = []
+    left = defaultdict(list)
     for count, path in enumerate(photos, 1):
         inside = path.relative_to(source)
         try:
@@ -488,8 +488,8 @@ def write_frames(video: Path, folder: Path, count: int, report: Report) -> list[
     """
     total = _frame_count(video)
     parts = min(count, total)
-    names: list[str] = []
-    last: MatLike | None = None
+    names = []
+    last = None
     frames = _frames(video, lambda done: report("choosing frames", done, total))
     for _, part in itertools.groupby(frames, key=lambda frame: frame[0] * parts // total):
         number, picture = max(part, key=lambda frame: sharpness(frame[1]))

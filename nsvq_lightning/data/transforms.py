@@ -279,7 +279,7 @@ def _frames(file: Path, allow_outside: bool) -> tuple[dict[str, Any], dict[str, 
         locate([path for frame in given if (path := frame.path(key))], file.parent, str(file), allow_outside)
         for key in ("file_path", "mask_path")
     )
-    frames: dict[str, _Frame] = {}
+    frames = {}
     for frame in given:
         frame = replace(frame, photo=photos[frame.path("file_path")], mask=masks.get(frame.path("mask_path")))
         if frame.name in frames:

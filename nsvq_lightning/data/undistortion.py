@@ -81,7 +81,7 @@ class Undistortion:
         """
         columns, rows, blank = self.maps()
         # replicate the border, so that the cubic kernel does not mix black into the edge of the crop
-        result: Uint8s = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        result = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         result[blank] = 0
         count = ~blank
         if kept is not None:
@@ -100,7 +100,7 @@ class Undistortion:
             return self._maps
         pixels = self._source_pixels()
         # more than a pixel outside, or NaN where the ray leaves the domain of the camera model
-        blank: Bools = np.any((pixels <= -1) | (pixels >= self._size) | np.isnan(pixels), axis=-1)
+        blank = np.any((pixels <= -1) | (pixels >= self._size) | np.isnan(pixels), axis=-1)
         columns, rows = (np.nan_to_num(pixels[..., i], nan=-1.0) for i in (0, 1))
         if blank.any() and not self._warned:
             self._warned = True

@@ -206,7 +206,7 @@ class SplatModule(LightningModule):
             splats = noisy_rows(splats, rows, quantizers, lambda name: draws("noise", name))
         elif self.phase >= Phase.QUANTIZE:
             splats = decoded(splats, quantizers)
-        options: dict[str, Any] = {"pixel_weights": pixel_weights}
+        options = {"pixel_weights": pixel_weights}
         if self.background == "random" and self.training:
             options["background"] = to_device(torch.rand(3, generator=draws("background")), self.device)
         return self.scene.render(splats, camera, **options)

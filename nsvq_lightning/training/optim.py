@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import Splats
@@ -133,8 +133,7 @@ def adapt_to_views(optimizer: torch.optim.Optimizer, rates: LearningRates, views
 
 def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
     """Adam of the paper over ``groups``: default betas, epsilon 1e-15, no weight decay; fused where torch can."""
-    parameters: list[Tensor] = [parameter for group in groups for parameter in group["params"]]
-    fused = all(p.device.type in ("cpu", "cuda") and p.is_floating_point() for p in parameters)
+    fused = all(group["params"][0].device.type in ("cpu", "cuda") for group in groups)
     return torch.optim.Adam(groups, eps=EPS, fused=True if fused else None)
 
 

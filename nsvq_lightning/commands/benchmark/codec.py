@@ -29,7 +29,7 @@ def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Measu
     # Codebooks of one step of k-means: sizes and times do not depend on how good they are.
     fitted = quantize.prepare(splats, scope.codebooks)
     scene = to_compressed(splats, {name: as_quantizer(each.quantizer) for name, each in fitted.items()})
-    writers: dict[str, Callable[[Path], int]] = {".ply": partial(save, splats)}
+    writers = {".ply": partial(save, splats)}
     for level in LEVELS:
         writers[f".nsvq {level}"] = partial(save, scene, storage=Storage(level))
     look = torch.no_grad()(partial(painted, "auto"))
