@@ -15,7 +15,8 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import optional
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import save
-from nsvq_lightning.io.nsvq.file import read_nsvq
+from nsvq_lightning.io.nsvq.file import paper_header, read_nsvq
+from nsvq_lightning.io.nsvq.header import Header
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
 from nsvq_lightning.report import numbers, page, pictures
@@ -81,7 +82,7 @@ class MetricReport(WritingCallback):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._scene: CompressedScene | None = None
-        self._paper_level: dict[str, Any] = {}
+        self._paper: Header
         self._scores: list[dict[str, Any]] = []
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
@@ -180,7 +181,7 @@ class MetricReport(WritingCallback):
             if trainer.is_global_zero:
                 scene = module.compressed()
                 save(scene, path, module.storage)
-                self._paper_level = numbers.paper_level(scene)
+                self._paper = paper_header(scene)
             trainer.strategy.barrier("scene.nsvq")
             self._scene = read_nsvq(path)
         # Detached tensors, not the module: a submodule would enter checkpoints.
@@ -223,7 +224,7 @@ class MetricReport(WritingCallback):
         if trainer.is_global_zero and scores:
             folder = run_folder(trainer)
             lpips = None if self._lpips is None else fmean(score["lpips"] for score in scores), self._lpips_reason
-            metrics = numbers.summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper_level)
+            metrics = numbers.summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper)
             with optional(folder / "metrics.json"):
                 numbers.write_metrics(folder / "metrics.json", metrics)
             with optional(folder / "views.csv"):

@@ -16,8 +16,7 @@ from nsvq_lightning.compression.importance import Renderer
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.nsvq.file import paper_header
-from nsvq_lightning.io.nsvq.header import read_header
+from nsvq_lightning.io.nsvq.header import Header, read_header
 from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import eight_bit, psnr
@@ -71,7 +70,7 @@ def summarize(
     scores: Rows,
     lpips: tuple[float | None, str | None],
     module: SplatModule,
-    paper: Values,
+    paper: Header,
 ) -> dict[str, Any]:
     """The content of ``metrics.json``; sizes in bytes, PSNR in dB, times in seconds.
 
@@ -81,7 +80,7 @@ def summarize(
         scores: Row of each test view in ``views.csv``: its name, ``psnr``, ``ssim``, ``cc_psnr`` and ``cc_ssim``.
         lpips: Mean LPIPS and None, or None and the reason.
         module: The module, for its history and schedule.
-        paper: :func:`paper_level` of the scene that was stored.
+        paper: Header of the scene that was stored at level ``paper``, with the bytes of the paper's formula.
     """
     scored = "psnr", "ssim", "cc_psnr", "cc_ssim"
     file_bytes = path.stat().st_size
@@ -100,17 +99,11 @@ def summarize(
         "level": header.level,
         "streams": {"header": header.size, **{stream.name: stream.length for stream in header.streams}},
         "codes": {name: _codes_in_use(codes, len(scene.codebooks[name])) for name, codes in scene.codes.items()},
-        "paper_level": dict(paper),
+        "paper_level": {"file_bytes": paper.file_bytes, "header_bytes": paper.size},
         "train_seconds": module.stopwatch.seconds,
         "before_quantization": last.get(Phase(Phase.QUANTIZE - 1).name.lower()) if scene.codebooks else None,
         "phases": list(last.values()),
     }
-
-
-def paper_level(scene: CompressedScene) -> dict[str, Any]:
-    """Bytes of the scene at level ``paper``: the paper's formula, with its header."""
-    header = paper_header(scene)
-    return {"file_bytes": header.file_bytes, "header_bytes": header.size}
 
 
 def write_metrics(path: Path, metrics: Values) -> None:
