@@ -17,7 +17,7 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
-from nsvq_lightning.splats.splats import RawSplats, Splats
+from nsvq_lightning.splats.splats import RawSplats, Splats, detached
 from nsvq_lightning.training import distributed, row_ops, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
@@ -272,7 +272,7 @@ class DensityControl(Densification):
             ranks = torch.where(grown, statistic, -torch.inf)
             grown &= most_contributing(ranks, max(0, self.max_splats - len(splats)))
         chosen = grown & ~large, grown & large
-        clones, parents = (RawSplats(*(tensor.detach()[mask] for tensor in splats.raw())) for mask in chosen)
+        clones, parents = (RawSplats(*(tensor[mask] for tensor in detached(splats))) for mask in chosen)
         children = split(parents, self.shrink, generator(module.seed, iteration, "split"))
         new = RawSplats(*(torch.cat(pair) for pair in zip(clones, children, strict=True)))
         return self.divide(trainer, module, grown & large, new)

@@ -19,14 +19,14 @@ from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, codebook_bits
-from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.splats.splats import RawSplats, detached
 from nsvq_lightning.training import distributed, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
 from .base import SplatCallback
 from .density import Densification, reset_opacities
-from .settings import ABOVE_0, AT_LEAST_1, Count, NonNegative, Opacity, Positive, Share, Whole
+from .settings import AT_LEAST_1, Count, NonNegative, Opacity, Positive, Share, Whole
 
 log = logging.getLogger(__name__)
 
@@ -48,9 +48,9 @@ class SplatBudget(SplatCallback):
 
     quality: Positive = 1.0
     """Times the default for the photos (:func:`nsvq_lightning.callbacks.growth.splats_for_photos`)."""
-    splats: Annotated[int, ABOVE_0] | None = None
+    splats: Count | None = None
     """Number of splats."""
-    bytes: Annotated[int, ABOVE_0] | None = None
+    bytes: Count | None = None
     """Size of the file at level ``compact``."""
     start: NonNegative = 0.8
     """Points to start with, as a share of the number of splats: those of SfM, and as many more as that takes from the
@@ -290,7 +290,7 @@ class BudgetedGrowth(Densification):
         progress = min(max((reference - self.start) / (self.full - self.start), 0.0), 1.0)
         room = int(self.limit(module) * math.sqrt(progress)) - len(splats)
         divided = draw_rows(candidates, room, generator(module.seed, iteration, "grow"))
-        parents = RawSplats(*(tensor.detach()[divided] for tensor in splats.raw()))
+        parents = RawSplats(*(tensor[divided] for tensor in detached(splats)))
         return room, self.divide(trainer, module, divided, split_longest(parents))
 
 

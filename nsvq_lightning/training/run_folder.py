@@ -138,8 +138,14 @@ def _let_go_of_all() -> None:
 
 # Files that show that a folder holds a run.
 RUN_FILES = (
-    *("scene.nsvq", "metrics.json", "metrics.csv", "curve.csv"),
-    *("checkpoints", "last.ckpt", "renders", "predictions"),
+    "scene.nsvq",
+    "metrics.json",
+    "metrics.csv",
+    "curve.csv",
+    "checkpoints",
+    "last.ckpt",
+    "renders",
+    "predictions",
 )
 
 

@@ -142,7 +142,7 @@ OUT_OF_RANGE = [
     (ShDegreeSchedule, {"every": 0}, "every must be at least 1, got 0"),
     (LearningRateDecay, {"final": 0.0}, r"final must be in \(0, 1\], got 0.0"),
     (SplatBudget, {"splats": 5, "bytes": 5}, "splats and bytes both say how large the scene is to be"),
-    (SplatBudget, {"bytes": 0}, "bytes must be above 0, got 0"),
+    (SplatBudget, {"bytes": 0}, "bytes must be at least 1, got 0"),
     (DensityControl, {"every": 0}, "every must be at least 1, got 0"),
     (DensityControl, {"min_opacity": 0.0}, "min_opacity must be between 0 and 1, got 0.0"),
     (DensityControl, {"shrink": 0.0}, "shrink must be above 0, got 0.0"),
