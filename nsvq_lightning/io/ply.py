@@ -240,8 +240,12 @@ def splat_degree(header: PlyHeader) -> int:
 
 
 def _needed(header: PlyHeader, sh_degree: int) -> dict[str, list[str]]:
-    """Properties to read of each attribute: discs may have no third scale, splats colours in place of coefficients."""
+    """Properties to read of each attribute: discs may have no third scale, splats colours in place of coefficients.
+
+    Those of the higher coefficients are in our order: the three colours of each.
+    """
     columns = splat_columns(sh_degree)
+    columns["shN"] = np.reshape(columns["shN"], (3, -1)).T.ravel().tolist()
     names = header.properties
     if "scale_2" not in names:
         columns["scales"] = columns["scales"][:2]
@@ -306,9 +310,8 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
     ends = np.cumsum([len(names) for names in columns.values()])
     start = 0
     for table in read_ply_columns(path, header, [*chain(*columns.values())]):
-        parts = dict(zip(columns, np.split(table, ends[:-1], axis=1), strict=True))
-        parts["shN"] = _by_coefficient(parts["shN"])
-        for name, part in parts.items():
+        parts = np.split(table, ends[:-1], axis=1)
+        for name, part in zip(columns, parts, strict=True):
             rows[name][start : start + len(table), : part.shape[1]] = part
         start += len(table)
     if columns["sh0"] == _RGB:
@@ -317,16 +320,6 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
     # Writers that store opacity as a byte make 0 and 255 infinite logits.
     rows["opacities"] = finite_logits(rows["opacities"])
     return rows
-
-
-def _by_coefficient(rows: Arrays) -> Arrays:
-    """Higher coefficients ``[N, D]``, all of red first, in our order: the three colours of each coefficient."""
-    return rows.reshape(len(rows), 3, rows.shape[1] // 3).swapaxes(1, 2).reshape(rows.shape)
-
-
-def _by_color(rows: Arrays) -> Arrays:
-    """Invert :func:`_by_coefficient`."""
-    return rows.reshape(len(rows), rows.shape[1] // 3, 3).swapaxes(1, 2).reshape(rows.shape)
 
 
 def read_ply_columns(
@@ -389,8 +382,8 @@ def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, 
         levels = _table(path, header.others["sh"])
         # Bytes stand for the middles of 256ths, the first and the last for the ends.
         values = (8 * (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1] - 0.5)).astype(np.float32)
-        columns = [values[levels[name]] for name in splat_columns(sh_degree)["shN"]]
-        rows["shN"] = _by_coefficient(np.stack(columns, axis=1))
+        columns = [values[levels[name]] for name in _needed(header, sh_degree)["shN"]]
+        rows["shN"] = np.stack(columns, axis=1)
     return rows
 
 
@@ -428,6 +421,11 @@ def write_ply(path: StrPath, scene: CompressedScene) -> int:
             table = np.concatenate([columns[name] for name in _ORDER], axis=1)
             file.write(table.astype("<f4", copy=False).tobytes())
         return file.tell()
+
+
+def _by_color(rows: Arrays) -> Arrays:
+    """Higher coefficients ``[N, D]``, the three colours of each, in the order of files: all of red first."""
+    return rows.reshape(len(rows), rows.shape[1] // 3, 3).swapaxes(1, 2).reshape(rows.shape)
 
 
 def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
