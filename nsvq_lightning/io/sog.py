@@ -61,12 +61,6 @@ _LARGEST = float(np.finfo(np.float32).max)
 _ZIP = b"PK\x03\x04"
 
 
-def picture_shape(count: int) -> tuple[int, int]:
-    """Height and width of the smallest nearly square picture of ``count`` texels, both multiples of 4."""
-    width = max(4, 4 * math.ceil(math.sqrt(count) / 4))
-    return max(4, 4 * math.ceil(count / width / 4)), width
-
-
 def sog_contents(scene: CompressedScene, palette: int = PALETTE_LIMIT) -> dict[str, bytes]:
     """The files of an archive or folder by name, ``meta.json`` first; splats keep their order.
 
@@ -378,12 +372,18 @@ def _packed_sh(rows: Float32s, labels: Int64s, sh_degree: int) -> tuple[Json, di
 
 
 def _picture(texels: Uint8s, shape: tuple[int, int] | None = None) -> Uint8s:
-    """Texels ``[N, C]`` as a picture ``[H, W, 4]``, nearly square by default; missing texels are black and opaque."""
-    height, width = shape or picture_shape(len(texels))
-    picture = np.zeros((height * width, 4), np.uint8)
+    """Texels ``[N, C]`` as a picture ``[H, W, 4]``; missing texels are black and opaque.
+
+    By default it is the smallest that is nearly square, with sides that are multiples of 4.
+    """
+    count, channels = texels.shape
+    if shape is None:
+        width = 4 * math.ceil(math.sqrt(count) / 4)
+        shape = 4 * math.ceil(count / width / 4), width
+    picture = np.zeros((math.prod(shape), 4), np.uint8)
     picture[:, 3] = 255
-    picture[: len(texels), : texels.shape[1]] = texels
-    return picture.reshape(height, width, 4)
+    picture[:count, :channels] = texels
+    return picture.reshape(*shape, 4)
 
 
 _PICTURES = (".webp", ".png")
