@@ -62,7 +62,7 @@ def write_lod(
     with suppress(FileNotFoundError, FormatError):
         old = _index(target)["filenames"]
     target.parent.mkdir(parents=True, exist_ok=True)
-    names: list[str] = []
+    folders: list[str] = []
     total = 0
     for number, splats in enumerate(levels):
         for part, runs in enumerate(_files([(rows[number], node) for rows, node in leaves])):
@@ -76,22 +76,21 @@ def write_lod(
                 total += len(data)
             offset = 0
             for rows, node in runs:
-                node["lods"][str(number)] = {"file": len(names), "offset": offset, "count": len(rows)}
+                node["lods"][str(number)] = {"file": len(folders), "offset": offset, "count": len(rows)}
                 offset += len(rows)
-            names.append(f"{folder}/{META}")
+            folders.append(folder)
     about = {
         "version": 1,
         "asset": {"generator": "nsvq-lightning"},
         "count": sum(counts),
         "counts": counts,
         "lodLevels": len(levels),
-        "filenames": names,
+        "filenames": [f"{folder}/{META}" for folder in folders],
         "tree": tree,
     }
     index = json.dumps(about, separators=(",", ":"))
     write_text(target, index)
-    ours = {name.partition("/")[0] for name in names}
-    for folder in {name.partition("/")[0] for name in old if name.count("/") == 1} - ours:
+    for folder in {name.partition("/")[0] for name in old if name.count("/") == 1}.difference(folders):
         shutil.rmtree(target.parent / folder, ignore_errors=True)
     return total + len(index)
 
