@@ -164,11 +164,11 @@ def _box_distances(dim, boxes, at, x, row):
 
 
 @inline
-def _code_distances(dim, codes, leaf, x, row):
-    """Squared distances of a query to the 16 codes of a leaf."""
+def code_distances(dim, codes, at, x, row):
+    """Squared distances of a query to 16 codes, whose columns follow each other."""
     total = simd.broadcast(0)
     for j in range(dim):
-        difference = simd.load(codes, (leaf * dim + j) * 16) - simd.get(x, row + j)
+        difference = simd.load(codes, at + 16 * j) - simd.get(x, row + j)
         total = simd.fma(difference, difference, total)
     return total
 
@@ -178,7 +178,7 @@ def _visit_leaf(dim, tree, leaf, x, i, limit, state):
     """Compare the codes of a leaf that are not farther than ``limit``; of equal distances the lower code wins."""
     codes, labels, _, _ = tree
     best, label, second, _, _, scratch, _ = state
-    distances = _code_distances(dim, codes, leaf, x, i * dim)
+    distances = code_distances(dim, codes, leaf * dim * 16, x, i * dim)
     bits = simd.mask_bits(distances <= limit)
     if bits != 0:
         simd.store(scratch, 0, distances)
@@ -243,7 +243,7 @@ def _guess(dim, tree, x, count, state):
         simd.put(guess, i, node * 16 + lane)
     for i in range(count):
         leaf = simd.get(guess, i)
-        distances = _code_distances(dim, codes, leaf, x, i * dim)
+        distances = code_distances(dim, codes, leaf * dim * 16, x, i * dim)
         limit = simd.lane_min(distances)
         if bounded:
             limit = simd.lane_min(simd.where(distances > limit, distances, np.inf))

@@ -20,7 +20,7 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import parallel, thread_count
 from nsvq_lightning.compute.memory import Array
-from nsvq_lightning.quantize.box_search import MAX_DIM, box_search, place_of_least
+from nsvq_lightning.quantize.box_search import MAX_DIM, box_search, code_distances, place_of_least
 from nsvq_lightning.quantize.scores import score_search
 
 
@@ -160,14 +160,10 @@ def _search_kernel(dim: int) -> Any:
             best, block_of = simd.broadcast(np.inf), simd.broadcast(0)
             for block in range(blocks):
                 at = block * 16 * (dim + 1)
-                total = simd.broadcast(0)
-                for j in range(dim):
-                    difference = simd.load(table, at + 16 * j) - simd.get(x, i * dim + j)
-                    total = simd.fma(difference, difference, total)
-                total = simd.fma(price, simd.load(table, at + 16 * dim), total)
-                cheaper = total < best
-                best = simd.where(cheaper, total, best)
-                block_of = simd.where(cheaper, block, block_of)
+                distances = code_distances(dim, table, at, x, i * dim)
+                total = simd.fma(price, simd.load(table, at + 16 * dim), distances)
+                block_of = simd.where(total < best, block, block_of)
+                best = simd.minimum(total, best)
             simd.put(result, i, place_of_least(best, block_of))
 
     return parallel(search)

@@ -93,11 +93,6 @@ def _inverses(squared):
 
 
 @inline
-def _inverse(squared):
-    return F(1.0) / squared if squared > _TINY else F(0.0)
-
-
-@inline
 def _short_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, stop):
     noise = np.empty(_ROWS * dim, np.float32)
     values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
@@ -143,7 +138,7 @@ def _long_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, 
                 residual, way = residual * simd.load(keep, 0), way * simd.load(keep, 0)
             error = simd.fma(residual, residual, error)
             squared = simd.fma(way, way, squared)
-        length = np.sqrt(simd.lane_sum(error) * _inverse(simd.lane_sum(squared)))
+        length = simd.sqrt(simd.lane_sum(error) * _inverses(simd.broadcast(simd.lane_sum(squared))))
         for j in range(vectors):
             place = min(16 * j, dim - 16)
             moved = simd.fma(length, simd.load(direction, place), simd.load(x, at + place))
@@ -212,7 +207,7 @@ def _long_backward(dim, grad, x, rows, codebook, codes, out, grad_x, sums, begin
                 residual, slope = residual * simd.load(keep, 0), slope * simd.load(keep, 0)
             dots = simd.fma(slope, simd.load(out, i * dim + place) - value, dots)
             squared = simd.fma(residual, residual, squared)
-        scale = simd.lane_sum(dots) * _inverse(simd.lane_sum(squared))
+        scale = simd.lane_sum(dots) * _inverses(simd.broadcast(simd.lane_sum(squared)))
         clear_between(rows, i, dim, grad_x)
         # The last two vectors overlap, so the last sums are read before any are written.
         last = simd.load(sums, code + dim - 16)

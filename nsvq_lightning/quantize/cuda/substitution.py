@@ -6,6 +6,7 @@ the arithmetic after them is the same sequence of roundings, polynomials include
 """
 
 import math
+from typing import Any
 
 import torch
 import triton
@@ -139,9 +140,16 @@ def radial_kernel(
     tl.store(radials + i * DIM + column, -radial, mask=inside)
 
 
-def _tile(dim: int) -> dict[str, int]:
+def _launch(kernel: Any, x: Tensor, rows: Tensor, codebook: Tensor, *arguments: Any) -> None:
+    """Run a kernel on the chosen rows of a table; after its arguments it gets how many rows and codes there are."""
+    dim = x.shape[1]
     width = triton.next_power_of_2(dim)
-    return {"DIM": dim, "WIDTH": width, "ROWS": max(1, 1024 // width)}  # 1024 elements per program
+    height = max(1, 1024 // width)  # 1024 elements per program
+    if len(rows):
+        with torch.cuda.device_of(x):
+            kernel[(triton.cdiv(len(rows), height),)](
+                *arguments, len(rows), len(x), len(codebook), DIM=dim, ROWS=height, WIDTH=width, **COMPILE
+            )
 
 
 def substitute(
@@ -164,13 +172,8 @@ def substitute(
     """
     substitution.check_inputs(x, rows, codebook, codes)
     out = x.new_empty(len(rows), x.shape[1])
-    tile = _tile(x.shape[1])
-    if len(rows):
-        with torch.cuda.device_of(x):
-            substitute_kernel[(triton.cdiv(len(rows), tile["ROWS"]),)](
-                seed, float(aim), float(spread), x, rows, codebook, codes, out, len(rows), len(x), len(codebook),
-                **tile, **COMPILE,
-            )  # fmt: skip
+    mix = seed, float(aim), float(spread)
+    _launch(substitute_kernel, x, rows, codebook, *mix, x, rows, codebook, codes, out)
     return out
 
 
@@ -187,13 +190,7 @@ def substitute_backward(
     """
     substitution.check_inputs(x, rows, codebook, codes, grad=grad, out=out)
     grad_x, radials = torch.zeros_like(x), torch.empty_like(out)
-    tile = _tile(x.shape[1])
-    if len(rows):
-        with torch.cuda.device_of(x):
-            radial_kernel[(triton.cdiv(len(rows), tile["ROWS"]),)](
-                grad, x, rows, codebook, codes, out, grad_x, radials, len(rows), len(x), len(codebook), **tile,
-                **COMPILE,
-            )  # fmt: skip
+    _launch(radial_kernel, x, rows, codebook, grad, x, rows, codebook, codes, out, grad_x, radials)
     return grad_x, sum_rows(radials, codes, len(codebook), x.dtype)
 
 
