@@ -142,12 +142,14 @@ def _polynomial(builder, x, coefficients):
 
 
 def _fused(builder, x, y, z):
+    """``x * y + z``, with one rounding where the processor supports it."""
     # Not llvm.fma: where the target processor lacks that instruction, llvm.fma calls a library function for every lane,
     # while llvm.fmuladd multiplies and adds.
     return _llvm(builder, "fmuladd.v16f32", [x, y, z])
 
 
 def _smaller(builder, x, y):
+    """The smaller of two; the second one where the first is NaN."""
     return builder.select(builder.fcmp_ordered("<", x, y), x, y)
 
 
@@ -238,10 +240,7 @@ def fetch_add(builder, array, offset, amount):
 # -------------------------------------------------------------------------------------------------------
 
 
-@_function(Lanes, Lanes, Lanes, Lanes)
-def fma(builder, x, y, z):
-    """``x * y + z``, with one rounding where the processor supports it."""
-    return _fused(builder, x, y, z)
+fma = _function(Lanes, Lanes, Lanes, Lanes)(_fused)
 
 
 @_function(Lanes, Lanes, Lanes, Lanes)
@@ -250,10 +249,7 @@ def fnma(builder, x, y, z):
     return _fused(builder, builder.fneg(x), y, z)
 
 
-@_function(Lanes, Lanes, Lanes)
-def minimum(builder, x, y):
-    """The smaller of two; the second one where the first is NaN."""
-    return _smaller(builder, x, y)
+minimum = _function(Lanes, Lanes, Lanes)(_smaller)
 
 
 @_function(Lanes, Lanes, Lanes)
@@ -390,7 +386,8 @@ def lane_sums(builder, vectors):
 
 
 def _transposed(builder, rows):
-    """Transpose 16 vectors as a 16x16 matrix: four rounds that swap blocks of 8, 4, 2 and 1 lanes."""
+    """``transpose((v0, …, v15))``: vector i of the result holds lane i of every argument."""
+    # Four rounds that swap blocks of 8, 4, 2 and 1 lanes.
     for block in (8, 4, 2, 1):
         low = [lane if not lane & block else WIDTH + lane - block for lane in range(WIDTH)]
         high = [lane + block if not lane & block else WIDTH + lane for lane in range(WIDTH)]
@@ -413,10 +410,7 @@ def load_vectors(builder, array, offset):
     return [_read(builder, builder.gep(first, [_i64(WIDTH * part)])) for part in range(WIDTH)]
 
 
-@_function(_SIXTEEN, _SIXTEEN)
-def transpose(builder, vectors):
-    """``transpose((v0, …, v15))``: vector i of the result holds lane i of every argument."""
-    return _transposed(builder, vectors)
+transpose = _function(_SIXTEEN, _SIXTEEN)(_transposed)
 
 
 def _row_addresses(builder, array, indices, start, stride):
