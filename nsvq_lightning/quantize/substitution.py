@@ -73,6 +73,12 @@ def fill_normal(seed, first, count, out):
 
 
 @inline
+def _new_group(dim):
+    """Vectors for 16 rows, one for each column."""
+    return np.zeros(16 * dim, np.float32)
+
+
+@inline
 def _take_row(dim, source, start, lane, group):
     """Copy a row into one lane of vectors."""
     for j in range(dim):
@@ -95,7 +101,7 @@ def _inverses(squared):
 @inline
 def _short_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, stop):
     noise = np.empty(_ROWS * dim, np.float32)
-    values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
+    values, chosen = _new_group(dim), _new_group(dim)
     fill_normal(seed, begin // 16 * dim, _ROWS // 16 * dim, noise)
     for first in range(begin, stop, 16):
         valid = min(16, stop - first)
@@ -103,7 +109,7 @@ def _short_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin,
             _take_row(dim, x, simd.get(rows, first + lane) * dim, lane, values)
             _take_row(dim, codebook, simd.get(codes, first + lane) * dim, lane, chosen)
         at = (first - begin) * dim
-        error, squared = simd.broadcast(0), simd.broadcast(0)
+        error = squared = simd.broadcast(0)
         for j in range(dim):
             residual = simd.load(chosen, 16 * j) - simd.load(values, 16 * j)
             direction = simd.fma(aim, residual, spread * simd.load(noise, at + 16 * j))
@@ -128,7 +134,7 @@ def _long_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, 
         if start == 0:
             fill_normal(seed, i * vectors, 2 * vectors, noise)
         at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
-        error, squared = simd.broadcast(0), simd.broadcast(0)
+        error = squared = simd.broadcast(0)
         for j in range(vectors):
             place = min(16 * j, dim - 16)
             residual = simd.load(codebook, code + place) - simd.load(x, at + place)
@@ -162,8 +168,8 @@ def _forward(dim: int) -> Any:
 
 @inline
 def _short_backward(dim, grad, x, rows, codebook, codes, out, grad_x, sums, begin, stop):
-    values, chosen = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
-    moved, slope = np.zeros(16 * dim, np.float32), np.zeros(16 * dim, np.float32)
+    values, chosen = _new_group(dim), _new_group(dim)
+    moved, slope = _new_group(dim), _new_group(dim)
     for first in range(begin, stop, 16):
         valid = min(16, stop - first)
         for lane in range(valid):
@@ -172,7 +178,7 @@ def _short_backward(dim, grad, x, rows, codebook, codes, out, grad_x, sums, begi
             _take_row(dim, codebook, simd.get(codes, i) * dim, lane, chosen)
             _take_row(dim, out, i * dim, lane, moved)
             _take_row(dim, grad, i * dim, lane, slope)
-        dots, squared = simd.broadcast(0), simd.broadcast(0)
+        dots = squared = simd.broadcast(0)
         for j in range(dim):
             value = simd.load(values, 16 * j)
             dots = simd.fma(simd.load(slope, 16 * j), simd.load(moved, 16 * j) - value, dots)
@@ -198,7 +204,7 @@ def _long_backward(dim, grad, x, rows, codebook, codes, out, grad_x, sums, begin
     keep = new_lanes(dim)
     for i in range(begin, stop):
         at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
-        dots, squared = simd.broadcast(0), simd.broadcast(0)
+        dots = squared = simd.broadcast(0)
         for j in range(vectors):
             place = min(16 * j, dim - 16)
             value, slope = simd.load(x, at + place), simd.load(grad, i * dim + place)

@@ -29,6 +29,8 @@ BLOCK = tl.constexpr(64)  # rows, or codes, per program of a check
 COPIED = tl.constexpr(1024)  # numbers per program of a copy
 MEMBERS = tl.constexpr(LIST)  # codes in the list of a row
 SLACK = tl.constexpr(ROUNDING)
+# A kernel that is compiled once for all numbers of rows.
+kernel_of_any_count = triton.jit(do_not_specialize=["count"])
 
 
 @triton.jit
@@ -66,7 +68,7 @@ def least_of(smallest, chosen, num_codes):
     return least, tl.min(tl.where(smallest == least[:, None], chosen, num_codes), 1)
 
 
-@triton.jit(do_not_specialize=["count"])
+@kernel_of_any_count
 def nearest_kernel(x, codebook, result, count, num_codes, code_stride, DIM: tl.constexpr):
     """Nearest code of each row ``[count, DIM]``."""
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
@@ -166,7 +168,7 @@ def have_jumped(ends, count):
     return 2 * tl.load(ends + count - 1) > count
 
 
-@triton.jit(do_not_specialize=["count"])
+@kernel_of_any_count
 def snapshot_kernel(codebook, snapshot, travelled, squared_drift, ends, count, size):
     """Take a snapshot of the codes, if they have jumped."""
     if have_jumped(ends, count):
@@ -176,7 +178,7 @@ def snapshot_kernel(codebook, snapshot, travelled, squared_drift, ends, count, s
             tl.store(travelled, tl.load(travelled) + drift_of(squared_drift))
 
 
-@triton.jit(do_not_specialize=["count"])
+@kernel_of_any_count
 def queue_kernel(ends, queue, count):
     """Line up the places at which the running sum ``ends`` rises."""
     place = tl.program_id(0).to(tl.int64) * COPIED + tl.arange(0, COPIED)
@@ -185,7 +187,7 @@ def queue_kernel(ends, queue, count):
     tl.store(queue + before, place.to(tl.int32), mask=end > before)
 
 
-@triton.jit(do_not_specialize=["count"])
+@kernel_of_any_count
 def check_kernel(
     x, rows, codebook, last, lists, anchors, clearance, limits, travelled, squared_drift, result, searched, count,
     DIM: tl.constexpr,
@@ -239,7 +241,7 @@ def check_kernel(
     tl.store(searched + place, (~proven).to(tl.int32), mask=inside)
 
 
-@triton.jit(do_not_specialize=["count"])
+@kernel_of_any_count
 def search_kernel(
     x, rows, queue, ends, codebook, last, lists, anchors, clearance, limits, travelled, squared_drift, result, count,
     num_codes, code_stride, DIM: tl.constexpr,
