@@ -7,7 +7,7 @@ from typing import Any, Literal, Protocol, cast
 import torch
 from torch import Tensor, nn
 
-from nsvq_lightning.quantize.kmeans import draw_far_rows, kmeans, lookup, mean_by_code
+from nsvq_lightning.quantize.kmeans import draw_far_rows, kmeans, lookup, mean_by_code, shuffled
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.tracking import NearestTracker
 from nsvq_lightning.random import generator as seeded
@@ -21,8 +21,8 @@ def copy_codes(active: Tensor, count: int, generator: torch.Generator) -> Tensor
     rows only once training has moved it.
     """
     rounds = -(-count // len(active))
-    order = [torch.randperm(len(active), generator=generator, device=generator.device) for _ in range(rounds)]
-    copies = active[torch.cat(order)[:count].to(active.device)]
+    order = [shuffled(active, generator) for _ in range(rounds)]
+    copies = active[torch.cat(order)[:count]]
     noise = torch.randn(count, active.shape[1], generator=generator, device=generator.device)
     return copies + 1e-12 * noise.to(active)
 

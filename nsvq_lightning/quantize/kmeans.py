@@ -130,19 +130,19 @@ def kmeans(
         used = weight > 0
         x, weight = x[used], weight.detach()[used].double()
     if start is None:
-        first = distinct_rows(x)
-        if len(first) <= k:
-            return x[first]
-        start = rows_far_apart(x[first], k, generator) if spread else x[first][_shuffled(len(first), x, generator)[:k]]
+        distinct = x[distinct_rows(x)]
+        if len(distinct) <= k:
+            return distinct
+        start = rows_far_apart(distinct, k, generator) if spread else distinct[shuffled(distinct, generator)[:k]]
     centroids = start.detach().clone()
     for _ in range(steps):
         centroids = mean_by_code(x, nearest(x, centroids), centroids, weight)
     return centroids
 
 
-def _shuffled(count: int, like: Tensor, generator: torch.Generator) -> Tensor:
-    """The numbers below ``count`` in random order."""
-    return torch.randperm(count, generator=generator, device=generator.device).to(like.device)
+def shuffled(rows: Tensor, generator: torch.Generator) -> Tensor:
+    """The numbers ``[N]`` of the rows ``[N, D]`` in random order."""
+    return torch.randperm(len(rows), generator=generator, device=generator.device).to(rows.device)
 
 
 def mean_by_code(x: Tensor, codes: Tensor, codebook: Tensor, weight: Tensor | None = None) -> Tensor:
@@ -195,12 +195,12 @@ def rows_far_apart(rows: Tensor, count: int, generator: torch.Generator) -> Tens
     An eighth is a random sample; then each of three rounds draws as many far rows as there already are. Rows so close
     to these that their squared distance is 0 come last.
     """
-    shuffled = _shuffled(len(rows), rows, generator)
-    chosen = shuffled[: -(-count // 8)]
+    order = shuffled(rows, generator)
+    chosen = order[: -(-count // 8)]
     while len(chosen) < count:
         far = draw_far_rows(rows, rows[chosen], min(len(chosen), count - len(chosen)), generator)
         if len(far) == 0:
-            rest = shuffled[~torch.isin(shuffled, chosen)]
+            rest = order[~torch.isin(order, chosen)]
             return rows[torch.cat([chosen, rest[: count - len(chosen)]])]
         chosen = torch.cat([chosen, far])
     return rows[chosen]
