@@ -38,6 +38,8 @@ _BEFORE = 11
 _KEY_CONTEXTS = (KEY_BITS + 1) * _BEFORE << _LENGTH_BITS
 # Contexts per column: the tree of the lengths, and the second bit by length.
 _INTEGER_CONTEXTS = 2 << _LENGTH_BITS
+# Whoever calls one gives it all the memory that it needs.
+_stream_kernel = partial(kernel, allocates=False)
 
 
 def encode_paths(paths: Int64s, bits: int, neighbours: Int32s) -> bytes:
@@ -55,18 +57,20 @@ def encode_paths(paths: Int64s, bits: int, neighbours: Int32s) -> bytes:
         TypeError: A dtype is wrong.
     """
     check_array("paths", paths, (len(neighbours),), INT64)
-    _check_paths(bits, neighbours)
+    contexts = _path_contexts(bits, neighbours)
     words = _room(len(paths) * bits)
-    used = _write_paths(paths, bits, neighbours, words, rc.new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
+    used = _write_paths(paths, bits, neighbours, words, contexts)
     return _bytes(words, used)
 
 
-def _check_paths(bits: int, neighbours: Int32s) -> None:
+def _path_contexts(bits: int, neighbours: Int32s) -> Uint32s:
+    """New contexts for the decisions of paths; refuses what no path may have."""
     if not 0 <= bits <= 32:
         raise ValueError(f"a path must have 0 to 32 bits, got {bits}")
     check_array("neighbours", neighbours, (len(neighbours), 2), INT32)
     if neighbours.size and (neighbours.min() < -1 or neighbours.max() >= len(neighbours)):
         raise ValueError(f"neighbours must be in [-1, {len(neighbours)}), got {neighbours.min()} to {neighbours.max()}")
+    return rc.new_contexts(_RELATIONS << min(bits, _MODELLED_BITS))
 
 
 def decode_paths(data: bytes | memoryview, bits: int, neighbours: Int32s) -> Int64s:
@@ -77,9 +81,9 @@ def decode_paths(data: bytes | memoryview, bits: int, neighbours: Int32s) -> Int
         ValueError: As for :func:`encode_paths`.
         TypeError: A dtype is wrong.
     """
-    _check_paths(bits, neighbours)
+    contexts = _path_contexts(bits, neighbours)
     paths, words = np.empty(len(neighbours), np.int64), _words(data)
-    used = _read_paths(words, bits, neighbours, paths, rc.new_contexts(_RELATIONS << min(bits, _MODELLED_BITS)))
+    used = _read_paths(words, bits, neighbours, paths, contexts)
     _check_used(words, used)
     return paths
 
@@ -209,7 +213,7 @@ def _context(first, second, path, left, bits):  # type: ignore[no-untyped-def]
     return _RELATIONS * node + 3 * _way(first, path, left) + _way(second, path, left)
 
 
-@partial(kernel, allocates=False)
+@_stream_kernel
 def _write_paths(paths, bits, neighbours, words, contexts):  # type: ignore[no-untyped-def]
     low, width, used = uint64(0), _START, 0
     plain = max(0, bits - _MODELLED_BITS)
@@ -225,7 +229,7 @@ def _write_paths(paths, bits, neighbours, words, contexts):  # type: ignore[no-u
     return rc.encode_end(low, words, used)
 
 
-@partial(kernel, allocates=False)
+@_stream_kernel
 def _read_paths(words, bits, neighbours, paths, contexts):  # type: ignore[no-untyped-def]
     code, width, used = rc.decode_start(words)
     plain = max(0, bits - _MODELLED_BITS)
@@ -295,7 +299,7 @@ def _key_context(depth, before):  # type: ignore[no-untyped-def]
     return (depth * _BEFORE + before // 6) << _LENGTH_BITS
 
 
-@partial(kernel, allocates=False)
+@_stream_kernel
 def _write_keys(keys, depths, words, contexts):  # type: ignore[no-untyped-def]
     low, width, used = uint64(0), _START, 0
     last, before = uint64(0), 0
@@ -311,7 +315,7 @@ def _write_keys(keys, depths, words, contexts):  # type: ignore[no-untyped-def]
     return rc.encode_end(low, words, used)
 
 
-@partial(kernel, allocates=False)
+@_stream_kernel
 def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
     code, width, used = rc.decode_start(words)
     last, before = uint64(0), 0
@@ -341,7 +345,7 @@ def _bit_lengths(values: Int64s) -> Int64s:
     return np.frexp(np.abs(values).astype(np.float64))[1].astype(np.int64)
 
 
-@partial(kernel, allocates=False)
+@_stream_kernel
 def _write_integers(values, words, contexts):  # type: ignore[no-untyped-def]
     low, width, used = uint64(0), _START, 0
     for i in range(values.shape[0]):
@@ -360,7 +364,7 @@ def _write_integers(values, words, contexts):  # type: ignore[no-untyped-def]
     return rc.encode_end(low, words, used)
 
 
-@partial(kernel, allocates=False)
+@_stream_kernel
 def _read_integers(words, by_steps, values, contexts):  # type: ignore[no-untyped-def]
     code, width, used = rc.decode_start(words)
     for i in range(values.shape[0]):
