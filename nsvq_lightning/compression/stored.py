@@ -5,7 +5,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -47,7 +46,7 @@ def to_compressed(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> Com
 
 
 def _numpy(tensor: Tensor) -> NDArray[Any]:
-    return np.asarray(tensor.detach().cpu().numpy())
+    return tensor.detach().cpu().numpy()
 
 
 @torch.no_grad()

@@ -139,7 +139,7 @@ def recycled(shape: tuple[int, ...]) -> Tensor:
         else:
             # The number of splats grows: a buffer that is a little too small now will not be requested again.
             del _FREE[large_enough : _count_free(size / 2)]
-            buffer = torch.empty(size + size // 8 + _PAGE, dtype=torch.float32).numpy()
+            buffer = aligned_empty((size + size // 8 + _PAGE,))
     view = buffer[:size].reshape(shape)  # which the tensor keeps alive
     weakref.finalize(view, _FREE.append, buffer)
     return torch.from_numpy(view)

@@ -93,9 +93,9 @@ class CompressedScene:
         Raises:
             ValueError: The shape of an attribute does not fit the others.
         """
-        from nsvq_lightning.splats.splats import check_shapes
+        from nsvq_lightning.splats.splats import check_shapes, detached
 
-        tensors = {name: getattr(splats, name).detach() for name in splat.ATTRIBUTES}
+        tensors = detached(splats)._asdict()
         check_shapes(tensors)
         return cls.from_rows(
             {name: tensor.cpu().numpy().astype(np.float32) for name, tensor in tensors.items()}, **header

@@ -110,7 +110,7 @@ def save(
     if any(scene.origin) and not entry.native:
         logger.warning("%s: the origin %s of the positions is not stored; add it in the viewer", path, scene.origin)
     if entry.native:
-        options["storage"] = storage or Storage()
+        options["storage"] = storage
     elif storage is not None:
         scene = as_stored(scene, storage)
     return entry.write(path, scene, **options)

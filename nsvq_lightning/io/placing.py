@@ -78,7 +78,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
 
     def turned_harmonics(rows: Float32s) -> Float64s:
         coefficients = rows.reshape(len(rows), len(harmonics), 3).astype(np.float64)
-        return np.asarray((harmonics @ coefficients).reshape(rows.shape))
+        return (harmonics @ coefficients).reshape(rows.shape)
 
     has_origin = any(scene.origin)
     means = scene.means.astype(np.float64) @ linear.T + (0 if has_origin else shift)

@@ -14,7 +14,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
 from nsvq_lightning.io.numbers import logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, UP_AXES, moved, rotated
-from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, sh_coefficients, unit
+from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, unit
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,6 @@ def write_usda(path: StrPath, scene: CompressedScene) -> int:
     """
     scene = rotated(scene, HALF_TURN)
     colors = np.concatenate([scene.rows("sh0"), scene.rows("shN")], axis=1)
-    per_splat = sh_coefficients(scene.sh_degree) + 1
     arrays: dict[str, Arrays] = {
         "point3f[] positions": scene.means,
         "quatf[] orientations": unit(scene.rows("quats")),
@@ -41,7 +40,7 @@ def write_usda(path: StrPath, scene: CompressedScene) -> int:
         f"float3[] {_COEFFICIENTS}": colors.reshape(-1, 3),
         "float3[] extent": np.stack([scene.means.min(0), scene.means.max(0)]),
     }
-    about_colors = f' (\n        elementSize = {per_splat}\n        interpolation = "vertex"\n    )'
+    about_colors = f' (\n        elementSize = {colors.shape[1] // 3}\n        interpolation = "vertex"\n    )'
     note = "    customData = { bool antialiased = 1 }\n" if scene.antialiased else ""
     with atomic_write(path) as file:
         file.write(

@@ -265,8 +265,9 @@ def score_search(x: Array, codebook: Array, with_lists: bool = False) -> tuple[A
     count, dim = x.shape
     check_array("codebook", codebook, (len(codebook), dim), FLOAT32)
     result = np.empty(count, np.int64)
-    lists = np.empty((count if with_lists else 0, LIST), np.int32)
-    distances = np.empty((2, count if with_lists else 0), np.float32)
+    listed = count if with_lists else 0
+    lists = np.empty((listed, LIST), np.int32)
+    distances = np.empty((2, listed), np.float32)
     thread_count()
     found = result, lists.ravel(), distances.ravel()
     _search_kernel(dim)(-(-len(x) // _TILE), x.ravel(), codebook.ravel(), *_centred(codebook), *found)

@@ -161,7 +161,7 @@ class Splats(nn.Module):
 
     def raw(self) -> RawSplats:
         """The six raw attributes, attached to the graph."""
-        return RawSplats(*(getattr(self, name) for name in ATTRIBUTES))
+        return RawSplats(**self.attributes())
 
     def add_table(self, name: str) -> Tensor:
         """Add (or get) a side table ``[N]`` of zeros that follows the rows through every edit and checkpoint."""
