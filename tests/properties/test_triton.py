@@ -90,7 +90,8 @@ def test_kernels_compile_as_they_are_launched(cases: str) -> None:
 def test_no_kernel_is_left_out() -> None:
     package = TESTS.parent / "nsvq_lightning"
     sources = [*package.glob("*/cuda/*.py"), package / "quality" / "ssim_cuda.py"]
-    launched = {name for path in sources for name in re.findall(r"(\w+_kernel)\[", path.read_text())}
+    launch = r"(?:_launch\((?=\w+_kernel)|(?=\w+_kernel\[))(\w+_kernel)"
+    launched = {name for path in sources for name in re.findall(launch, path.read_text())}
     defined = {name for path in sources for name in re.findall(r"def (\w+_kernel)\(", path.read_text())}
     assert launched == defined == set(REGISTERS)
 
