@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.quality.ssim import check_pair, in_range, plain_ssim
+from nsvq_lightning.quality.formulas import check_pair, in_range, plain_ssim
 
 
 def apply_mask(image: Tensor, mask: Tensor | None) -> Tensor:

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
+from nsvq_lightning.quality.formulas import check_pair
 from nsvq_lightning.quality.loss import apply_mask, mean_of_kept
-from nsvq_lightning.quality.ssim import check_pair
 
 
 def color_corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -19,7 +19,7 @@ from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.formulas import for_triton
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quality import formulas as shared
-from nsvq_lightning.quality.ssim import SSIM_RADIUS, check_pair, ssim_window
+from nsvq_lightning.quality.formulas import SSIM_RADIUS, check_pair, ssim_window
 
 formulas = for_triton(shared)
 

@@ -6,7 +6,7 @@ import torch
 from torch_formulas import in_torch
 
 from nsvq_lightning.quality import formulas
-from nsvq_lightning.quality.ssim import SSIM_C1, SSIM_C2
+from nsvq_lightning.quality.formulas import SSIM_C1, SSIM_C2
 
 f = in_torch(formulas)
 
