@@ -10,8 +10,11 @@ BLUR = 0.3
 # Contributions below one 8-bit step are skipped.
 ALPHA_MIN = 1.0 / 255.0
 
-# Smallest factor of an opacity by anti-aliasing: far below what any pixel shows, and its logarithm is finite.
+# Smallest factor of an opacity by sampling: far below what any pixel shows, and its logarithm is finite.
 FAINTEST = 1e-6
+
+# A splat counts as at most so many times as near as in training, squared: its blur covers any picture.
+MAX_RATIO = 1e9
 
 # Opacity of one splat at one pixel is capped here; the cap has no gradient.
 ALPHA_MAX = 0.99

@@ -2,8 +2,9 @@
 
 Numbers are of many splats, or pixels, at a time; a vector is a triple of them. A *view* is the camera as formulas take
 it: the three rows of its rotation, its translation, both focal lengths in pixels, and for x and y the lowest and the
-highest slope at which a Jacobian is evaluated. *Antialiased* is None or not, which is known when a kernel is compiled:
-without anti-aliasing it has no code for it.
+highest slope at which a Jacobian is evaluated. *Sampling* is the nearest and the farthest distance that training saw a
+splat from, and (focal length here / there)², or None, which is known when a kernel is compiled: then it has no code for
+it.
 
 Equations: EWA splatting (Zwicker et al. 2001) as used by 3D Gaussian Splatting (Kerbl et al. 2023, sec. 4).
 """
@@ -20,8 +21,9 @@ TRANSMITTANCE_MIN = F(constants.TRANSMITTANCE_MIN)
 BLUR, BLUR_SQUARED = F(constants.BLUR), F(constants.BLUR**2)
 MIN_SQUARED_NORM = F(conventions.MIN_SQUARED_NORM)
 FINITE = F(constants.FINITE)
-# Square of the smallest factor by which anti-aliasing dims.
+# Square of the smallest factor by which sampling dims.
 MIN_LIGHT = F(constants.FAINTEST**2)
+MAX_RATIO = F(constants.MAX_RATIO)
 HUGE_FOOTPRINT, LARGEST_FOOTPRINT = F(constants.HUGE_FOOTPRINT), F(constants.LARGEST_FOOTPRINT)
 HUGE_QUATERNION, SHRINK = F(constants.HUGE_QUATERNION), F(constants.SHRINK)
 LOG2_ALPHA_MIN = F(math.log2(constants.ALPHA_MIN))
@@ -153,11 +155,35 @@ def pixel_range(centre, half, size):
 
 
 @inline
-def footprint(view, screen, point, quat, log_scales, logit, antialiased):
+def nearer(point, sampling):
+    """How many times as near as in training a splat is, squared; below 1 where it is farther, 1 where it is neither."""
+    nearest, farthest, _ = sampling
+    squared = dot3(point, point)
+    nearest, farthest = nearest * nearest, farthest * farthest
+    outside = simd.where(squared < nearest, nearest, simd.where(squared > farthest, farthest, squared))
+    return simd.minimum(outside / squared, MAX_RATIO)
+
+
+@inline
+def sampling_ratio(point, sampling):
+    """r²: pixels per unit of world at a splat, relative to training, squared."""
+    _, _, size = sampling
+    return size * nearer(point, sampling)
+
+
+@inline
+def blurred(area, size, unit, ratio):
+    """Determinant, in ``unit``s, of a covariance of determinant ``area`` in them and trace ``size`` with blur·ratio."""
+    return area + simd.fma(BLUR * ratio, size, BLUR_SQUARED * ratio * ratio) * unit * unit
+
+
+@inline
+def footprint(view, screen, point, quat, log_scales, logit, sampling):
     """Which splats can change the image, their records without the colour, their tiles and radii.
 
-    ``screen`` are principal point, width and height in pixels, and the near plane. With anti-aliasing, opacities are
-    multiplied by √(det Σ / det(Σ + blur·I)), but for splats so large that the blur does not matter.
+    ``screen`` are principal point, width and height in pixels, and the near plane. The blur that a splat was trained
+    with is blur·r² here, see :func:`sampling_ratio`. Where that is less than a pixel's own, opacities are multiplied by
+    √(det(Σ + blur·r²·I) / det(Σ + blur·I)), but for splats so large that the blur does not matter.
     """
     cx, cy, width, height, near = screen
     x, y, z = point
@@ -170,15 +196,21 @@ def footprint(view, screen, point, quat, log_scales, logit, antialiased):
     unit = simd.where(size > HUGE_FOOTPRINT, 1 / size, 1.0)
     n = scale3(unit, cross(u, v))
     area = dot3(n, n)
-    determinant = area + simd.fma(BLUR, size, BLUR_SQUARED) * unit * unit
-    xx, yy = xx + BLUR, yy + BLUR
-
+    if sampling is None:
+        determinant = area + simd.fma(BLUR, size, BLUR_SQUARED) * unit * unit
+        xx, yy = xx + BLUR, yy + BLUR
+    else:
+        ratio = sampling_ratio(point, sampling)
+        added = simd.maximum(ratio, 1.0)
+        determinant = blurred(area, size, unit, added)
+        xx, yy = simd.fma(added, BLUR, xx), simd.fma(added, BLUR, yy)
     _, _, focal, _, _ = view
     px, py = simd.fma(focal[0], x * inverse, cx), simd.fma(focal[1], y * inverse, cy)
     log2_opacity = -simd.log2(1 + exp2_clamped(-(logit * LOG2_E)))
-    if antialiased is not None:
-        kept = simd.where(size < HUGE_FOOTPRINT, area / determinant, 1.0)
-        log2_opacity = log2_opacity + 0.5 * simd.log2(simd.maximum(kept, MIN_LIGHT))
+    if sampling is not None:
+        kept = blurred(area, size, unit, ratio) / determinant
+        light = 0.5 * simd.log2(simd.maximum(kept, MIN_LIGHT))
+        log2_opacity = log2_opacity + simd.where((ratio < 1) & (size < HUGE_FOOTPRINT), light, 0.0)
     # α reaches 1/255 where u² + v² ≤ log2(255 o): a box of half sizes √(2 ln(255 o)·Σ_ii).
     reach = (log2_opacity - LOG2_ALPHA_MIN) * TWO_LN2
     within = simd.maximum(reach, 0.0)
@@ -348,25 +380,27 @@ def axes_backward(view, point, local, axes, gu, gv, centre, g_depth):
 
 
 @inline
-def light_gradient(u, v, h):
-    """Gradients of the rows u and v of U through the factor of anti-aliasing, from that of its logarithm, ``h``.
+def light_gradient(u, v, ratio, h):
+    """Gradients of the rows u and v of U and of r² < 1 through the factor of sampling, from that of its logarithm.
 
-    With A = det Σ, S the sum of the variances and D = A + b·S + b², the factor is ρ = √(A/D), and
-    d log ρ = ½·((b·S + b²)/(A·D)·dA − b/D·dS), where dA = 2·((v × n)·du + (n × u)·dv) with n = u × v.
+    With A = det Σ, S the sum of the variances, D(x) = A + x·S + x² and k = b·r², the factor is ρ = √(D(k)/D(b)), and
+    d log ρ = ½·(1/D(k) − 1/D(b))·dA + ½·(k/D(k) − b/D(b))·dS + ½·(S + 2k)/D(k)·dk, where
+    dA = 2·((v × n)·du + (n × u)·dv) with n = u × v, and dS = 2·(u·du + v·dv).
     """
     n = cross(u, v)
     area, size = dot3(n, n), dot3(u, u) + dot3(v, v)
-    added = simd.fma(BLUR, size, BLUR_SQUARED)
-    whole = area + added
-    # At the floor, and where the blur does not matter, the factor is constant.
-    free = (size < HUGE_FOOTPRINT) & (area > MIN_LIGHT * whole)
-    by_size = simd.where(free, -(h * BLUR / whole), 0.0)
-    by_n = scale3(simd.where(free, h * added / area / whole, 0.0), n)
-    return fma3(by_size, u, cross(v, by_n)), fma3(by_size, v, cross(by_n, u))
+    kept, whole = blurred(area, size, 1.0, ratio), blurred(area, size, 1.0, 1.0)
+    # At the floor, within the sampling of training, and where the blur does not matter, the factor is constant.
+    free = (size < HUGE_FOOTPRINT) & (kept > MIN_LIGHT * whole) & (ratio < 1)
+    per_kept, lost = h / kept, BLUR * (1 - ratio)
+    by_size = simd.where(free, lost * per_kept * (BLUR_SQUARED * ratio - area) / whole, 0.0)
+    by_n = scale3(simd.where(free, lost * per_kept * (size + BLUR * (1 + ratio)) / whole, 0.0), n)
+    by_ratio = simd.where(free, 0.5 * BLUR * per_kept * (size + 2 * BLUR * ratio), 0.0)
+    return fma3(by_size, u, cross(v, by_n)), fma3(by_size, v, cross(by_n, u)), by_ratio
 
 
 @inline
-def geometry_backward(view, point, quat, log_scales, factor, moments, h, centre, g_depth, antialiased):
+def geometry_backward(view, point, quat, log_scales, factor, moments, h, centre, g_depth, sampling):
     """Gradients of mean (without the colour's share), quaternion and log-scales.
 
     ``factor`` are A, B and C of the record, ``moments`` the sums of h·u², h·u·v and h·v², ``h`` the sum of h alone.
@@ -380,17 +414,34 @@ def geometry_backward(view, point, quat, log_scales, factor, moments, h, centre,
     # identity the first is a·(v × (u × v) + blur·u)/|v|², which stays accurate for needles.
     a, b, c = factor
     uu, uv, vv = scale3(MOMENT_SCALE, moments)
-    per_yy = 1 / (dot3(v, v) + BLUR)
+    if sampling is None:
+        per_yy = 1 / (dot3(v, v) + BLUR)
+        share = BLUR * per_yy
+    else:
+        ratio = sampling_ratio(point, sampling)
+        blur = BLUR * simd.maximum(ratio, 1.0)
+        per_yy = 1 / (dot3(v, v) + blur)
+        share = blur * per_yy
     n = cross(v, scale3(per_yy, cross(u, v)))
-    r, s = scale3(a, fma3(BLUR * per_yy, u, n)), scale3(c, v)
+    r, s = scale3(a, fma3(share, u, n)), scale3(c, v)
     e, f = fma3(uu, r, scale3(uv, s)), fma3(uv, r, scale3(vv, s))
     gu, gv = scale3(a, e), fma3(b, e, scale3(c, f))
     g_scale = simd.fma(r[0], e[0], s[0] * f[0]), simd.fma(r[1], e[1], s[1] * f[1]), simd.fma(r[2], e[2], s[2] * f[2])
-    if antialiased is not None:
-        light_u, light_v = light_gradient(u, v, h)
+    if sampling is not None:
+        light_u, light_v, by_ratio = light_gradient(u, v, ratio, h)
         gu, gv = add3(gu, light_u), add3(gv, light_v)
         g_scale = add3(g_scale, add3(times3(light_u, u), times3(light_v, v)))
     g_mean, g_quat = axes_backward(view, point, local, axes, gu, gv, centre, g_depth)
+    if sampling is not None:
+        # Where r² > 1, the blur is b·r², and dL/db half the trace of Fᵀ S F.
+        trace = simd.fma(uu, a * a, uu * (b * b)) + simd.fma(2 * uv, b * c, vv * (c * c))
+        by_ratio = simd.where(ratio > 1, 0.5 * BLUR * trace, by_ratio)
+        # Outside the distances of training, r² falls with the square of the distance.
+        times_nearer = nearer(point, sampling)
+        constant = (times_nearer >= 1) & (times_nearer <= 1) | (times_nearer >= MAX_RATIO)
+        per_distance = simd.where(constant, 0.0, -2 * by_ratio * ratio / dot3(point, point))
+        rotation, _, _, _, _ = view
+        g_mean = add3(g_mean, times(columns(rotation), scale3(per_distance, point)))
     return g_mean, g_quat, g_scale
 
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from nsvq_lightning.compute.devices import resolve_backend
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.sampling import Sampling, ViewSampling, focal_of
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, check_shapes, sh_degree_of
 
@@ -44,6 +45,7 @@ def render(
     background: Tensor | None = None,
     pixel_weights: Tensor | None = None,
     antialiased: bool = False,
+    sampling: Sampling | Tensor | float | None = None,
     backend: str = "auto",
 ) -> Render:
     """Render splats as a camera sees them (3D Gaussian Splatting, eq. 3), differentiable in all six raw attributes.
@@ -57,6 +59,10 @@ def render(
             holds.
         antialiased: Make splats fainter as the rasterizer's blur makes them larger, so that those smaller than a pixel
             look alike from near and far (Mip-Splatting, Yu et al. 2024). For scenes that were trained so.
+        sampling: How training saw the splats: the blur that was trained keeps its size in the scene, so that pictures
+            of other sizes and from other distances look as those of training do, which do not change
+            (:mod:`nsvq_lightning.rendering.sampling`). Or the pixels per unit of the scene that they were trained at,
+            focal length / distance, one number or one a splat ``[N]``. Without effect with ``antialiased``.
         backend: One of :data:`nsvq_lightning.compute.devices.BACKENDS`.
 
     Returns:
@@ -65,7 +71,7 @@ def render(
     Raises:
         ValueError: Unknown back-end, or a back-end that cannot take the device or type of the splats; attributes that
             differ in device or type, or whose shapes do not fit; ``sh_degree`` above the stored degree; a background
-            that is not ``[3]``; pixel weights that is not ``[H, W]``.
+            that is not ``[3]``; pixel weights that is not ``[H, W]``; sampling of other splats, or not above 0.
     """
     splats = _checked(splats)
     stored = sh_degree_of(splats.shN)
@@ -85,11 +91,32 @@ def render(
             raise ValueError(f"pixel_weights must be {expected}, got {list(pixel_weights.shape)}")
         absgrad = means.new_zeros(means.shape[0], 3).requires_grad_()
         pixel_weights = pixel_weights.detach().to(means).contiguous()
-    # None for False: kernels without anti-aliasing are compiled without its code.
+    view_sampling = None
+    if antialiased:  # no blur is kept
+        view_sampling = ViewSampling(means.new_zeros(2, len(means)), 0.0)
+    elif sampling is not None:
+        view_sampling = _sampling(means, camera, sampling)
     image, alpha, radii, means2d, depth = _module_of(backend, means).render(
-        splats, camera, degree, background, pixel_weights, absgrad, antialiased or None
+        splats, camera, degree, background, pixel_weights, absgrad, view_sampling
     )
     return Render(image, alpha, radii, means2d, depth, absgrad)
+
+
+def _sampling(means: Tensor, camera: Camera, sampling: Sampling | Tensor | float) -> ViewSampling:
+    if not isinstance(sampling, Sampling):
+        density = torch.as_tensor(sampling).to(means)
+        if not (density > 0).all():
+            raise ValueError("sampling must be above 0: pixels per unit of the scene that the splats were trained at")
+        distance = focal_of(camera) / density
+        if distance.dim() == 0:
+            distance = distance.expand(len(means))
+        sampling = Sampling(distance, distance, [focal_of(camera)])
+    n = len(means)
+    lengths = [list(distance.shape) for distance in (sampling.nearest, sampling.farthest)]
+    if lengths != [[n], [n]]:
+        raise ValueError(f"sampling must be that of {n} splats, got {' and '.join(map(str, lengths))}")
+    distances, size = sampling.in_view(camera)
+    return ViewSampling(distances.detach().to(means).contiguous(), size)
 
 
 def _checked(splats: SplatTensors) -> RawSplats:

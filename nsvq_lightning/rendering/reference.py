@@ -12,6 +12,7 @@ from torch.utils.checkpoint import checkpoint
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.sampling import ViewSampling
 from nsvq_lightning.rendering.sh import sh_colors
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
@@ -74,7 +75,26 @@ def image_axes(
     return (x, y, z), (across[:, :, None] * axes).sum(1), (along[:, :, None] * axes).sum(1)
 
 
-def project(splats: SplatTensors, camera: Camera) -> Projection:
+def sampling_ratio(means: Tensor, camera: Camera, sampling: ViewSampling) -> Tensor:
+    """r² ``[N]``: pixels per unit of world at splats of centres ``[N, 3]``, relative to training, squared.
+
+    Within the distances of training, that is (focal length here / there)².
+    """
+    viewmat = camera.viewmat.to(means)
+    squared = (times_vectors(viewmat[:3, :3], means) + viewmat[:3, 3]).square().sum(1)
+    nearest, farthest = sampling.distances.to(means).square()
+    trained = torch.where(squared < nearest, nearest, torch.where(squared > farthest, farthest, squared))
+    return sampling.size * (trained / squared).clamp_max(constants.MAX_RATIO)
+
+
+def blur_of(splats: SplatTensors, camera: Camera, sampling: ViewSampling | None) -> Tensor:
+    """Blur ``[N]`` in square pixels: the rasterizer's own, or what a splat was trained with where that is larger."""
+    if sampling is None:
+        return splats.means.new_full(splats.means.shape[:1], constants.BLUR)
+    return constants.BLUR * sampling_ratio(splats.means, camera, sampling).clamp_min(1)
+
+
+def project(splats: SplatTensors, camera: Camera, sampling: ViewSampling | None = None) -> Projection:
     """Project splats through the local affine approximation of the camera (EWA splatting).
 
     The determinant uses Lagrange's identity, |u|²|v|² - (u·v)² = |u × v|²: the naive difference loses every digit for
@@ -86,20 +106,22 @@ def project(splats: SplatTensors, camera: Camera) -> Projection:
     size = (xx + yy).detach()
     unit = torch.where(size > constants.HUGE_FOOTPRINT, 1 / size, torch.ones_like(size))
     determinant = (torch.linalg.cross(u, v) * unit[:, None]).square().sum(-1)
-    determinant = determinant + (constants.BLUR * (xx + yy) + constants.BLUR * constants.BLUR) * unit * unit
-    conics = torch.stack([yy + constants.BLUR, -xy, xx + constants.BLUR], -1) * (unit / determinant * unit)[:, None]
+    blur = blur_of(splats, camera, sampling)
+    xx, yy = xx + blur, yy + blur
+    determinant = determinant + blur * (xx + yy - blur) * unit * unit
+    conics = torch.stack([yy, -xy, xx], -1) * (unit / determinant * unit)[:, None]
     reach = 2 * (torch.sigmoid(splats.opacities.detach()) / constants.ALPHA_MIN).log().clamp_min(0)
-    half = (reach[:, None] * (torch.stack([xx, yy], -1).detach() + constants.BLUR)).sqrt()
+    half = (reach[:, None] * torch.stack([xx, yy], -1).detach()).sqrt()
     return Projection(torch.stack([fx * x / z + cx, fy * y / z + cy], -1), conics, z, half)
 
 
 @torch.no_grad()
-def visible(splats: SplatTensors, camera: Camera) -> Tensor:
+def visible(splats: SplatTensors, camera: Camera, sampling: ViewSampling | None = None) -> Tensor:
     """Rows ``[V]`` of the splats in front of the near plane that reach 1/255 at a pixel centre of the image.
 
     Those with a non-finite geometry are left out.
     """
-    means2d, conics, depths, half_sizes = project(splats, camera)
+    means2d, conics, depths, half_sizes = project(splats, camera, sampling)
     low = (means2d - half_sizes - 0.5).ceil().clamp_min(0)
     size = means2d.new_tensor([camera.width - 1, camera.height - 1])
     high = torch.minimum((means2d + half_sizes - 0.5).floor(), size)
@@ -107,10 +129,11 @@ def visible(splats: SplatTensors, camera: Camera) -> Tensor:
     return ((depths > camera.near) & reached & torch.isfinite(conics).all(-1)).nonzero()[:, 0]
 
 
-def light_kept(splats: SplatTensors, camera: Camera, rows: Tensor) -> Tensor:
-    """What anti-aliasing multiplies the opacities of the splats ``rows [V]`` by, int64, ascending: ``[V]``.
+def light_kept(splats: SplatTensors, camera: Camera, rows: Tensor, sampling: ViewSampling) -> Tensor:
+    """What the opacities of the splats ``rows [V]``, int64, ascending, are multiplied by: ``[V]``.
 
-    √(det Σ / det(Σ + blur·I)) with Σ the projected covariance, differentiable in means, quaternions and log-scales.
+    √(det(Σ + blur·r²·I) / det(Σ + blur·I)) with Σ the projected covariance and r² as in :func:`sampling_ratio` where
+    that is below 1, differentiable in means, quaternions and log-scales.
     """
     means, quats, scales = (take_rows(getattr(splats, name), rows) for name in ("means", "quats", "scales"))
     _, u, v = image_axes(means, quats, scales, camera)
@@ -118,20 +141,22 @@ def light_kept(splats: SplatTensors, camera: Camera, rows: Tensor) -> Tensor:
     counts = (u.square().sum(1) + v.square().sum(1)).detach() < constants.HUGE_FOOTPRINT
     u, v = torch.where(counts[:, None], u, 0.0), torch.where(counts[:, None], v, 0.0)
     area = torch.linalg.cross(u, v).square().sum(1)  # det Σ by Lagrange's identity, which loses no digits
-    blurred = constants.BLUR * (u.square().sum(1) + v.square().sum(1)) + constants.BLUR * constants.BLUR
-    factor = (area / (area + blurred)).clamp_min(constants.FAINTEST * constants.FAINTEST).sqrt()
+    size = u.square().sum(1) + v.square().sum(1)
+    own, kept = constants.BLUR, constants.BLUR * sampling_ratio(means, camera, sampling.of(rows)).clamp_max(1)
+    ratio = (area + kept * (size + kept)) / (area + own * (size + own))
+    factor = ratio.clamp_min(constants.FAINTEST * constants.FAINTEST).sqrt()
     return torch.where(counts, factor, 1.0)
 
 
-def compensated(splats: SplatTensors, camera: Camera) -> RawSplats:
-    """The splats with the opacities that keep their light when the rasterizer blurs them by 0.3 square pixels.
+def compensated(splats: SplatTensors, camera: Camera, sampling: ViewSampling) -> RawSplats:
+    """The splats with the opacities that keep their light when the rasterizer blurs them more than training did.
 
-    Each opacity in view is multiplied by √(det Σ / det(Σ + 0.3·I)) with Σ the projected covariance before the blur, the
-    factor of Mip-Splatting's 2D filter (Yu et al. 2024): a splat that the blur makes twice as large becomes half as
-    opaque. The factor is differentiable in means, quaternions and scales, and depends on the camera.
+    Each opacity in view is multiplied by :func:`light_kept`, with anti-aliasing the factor of Mip-Splatting's
+    2D filter (Yu et al. 2024): a splat that the blur makes twice as large becomes half as opaque. The factor is
+    differentiable in means, quaternions and scales, and depends on the camera.
     """
-    rows = visible(splats, camera)
-    opacity = take_rows(splats.opacities, rows).sigmoid() * light_kept(splats, camera, rows)
+    rows = visible(splats, camera, sampling)
+    opacity = take_rows(splats.opacities, rows).sigmoid() * light_kept(splats, camera, rows, sampling)
     opacity = opacity.clamp_max(1 - 2.0**-20)  # the rasterizer caps it lower, and its logit is finite
     seen = splats.opacities.index_copy(0, rows, opacity.log() - (-opacity).log1p())
     return RawSplats(**{name: getattr(splats, name) for name in ATTRIBUTES} | {"opacities": seen})
@@ -144,27 +169,27 @@ def render(
     background: Tensor,
     pixel_weights: Tensor | None = None,
     absgrad: Tensor | None = None,
-    antialiased: bool | None = None,
+    sampling: ViewSampling | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``, differentiable.
 
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.
     """
-    if antialiased:
-        splats = compensated(splats, camera)
-    rows = visible(splats, camera)
-    seen = RawSplats(*(getattr(splats, name)[rows] for name in ATTRIBUTES))
-    projection = project(seen, camera)
+    if sampling is not None:
+        splats = compensated(splats, camera, sampling)
+    rows = visible(splats, camera, sampling)
+    shown = RawSplats(*(getattr(splats, name)[rows] for name in ATTRIBUTES))
+    projection = project(shown, camera, None if sampling is None else sampling.of(rows))
     n = splats.means.shape[0]
     means2d = splats.means.new_zeros(n, 2).index_copy(0, rows, projection.means2d)
     radii = torch.zeros(n, dtype=torch.int32, device=rows.device)
     radii[rows] = projection.half_sizes.amax(-1).ceil().clamp_max(2**30).to(torch.int32)
 
-    direction = seen.means - camera.to(seen.means.device, seen.means.dtype).position
+    direction = shown.means - camera.to(shown.means.device, shown.means.dtype).position
     direction = direction / direction.square().sum(-1, keepdim=True).clamp_min(1e-20).sqrt()
-    colors = sh_colors(direction, seen.sh0, seen.shN, sh_degree)
+    colors = sh_colors(direction, shown.sh0, shown.shN, sh_degree)
     features = torch.cat([colors, projection.depths[:, None]], -1)
-    opacities = torch.sigmoid(seen.opacities)
+    opacities = torch.sigmoid(shown.opacities)
     centres = means2d[rows]
 
     order = torch.sort(projection.depths.detach(), stable=True).indices

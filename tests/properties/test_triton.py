@@ -67,7 +67,7 @@ ANTIALIASED_REGISTERS = 8
     [
         "radii blend search_45",
         pytest.param(
-            "project_0 project_3 project_antialiased tiles blend_and_observe loss loss_of_one_row",
+            "project_0 project_3 project_sampled tiles blend_and_observe loss loss_of_one_row",
             marks=pytest.mark.slow,
         ),
         pytest.param("nearest_3 nearest_45 search_3 substitute_3 substitute_45 sums_3 sums_45", marks=pytest.mark.slow),

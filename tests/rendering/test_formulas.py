@@ -11,6 +11,7 @@ from torch_formulas import in_torch
 
 from nsvq_lightning.rendering import formulas, reference
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.sampling import ViewSampling
 from nsvq_lightning.rendering.sh import sh_basis
 from nsvq_lightning.splats.splats import RawSplats
 
@@ -41,8 +42,31 @@ def axes(splats: RawSplats, camera: Camera) -> torch.Tensor:
     return torch.stack([torch.stack(f.image_axes(row, m), 1) for row in rows])
 
 
-@pytest.mark.parametrize("antialiased", [None, True])
-def test_splats_lie_where_the_reference_puts_them(antialiased: bool | None) -> None:
+# Distances that training saw splats from, as shares of those of the scene's camera, and the size of its pictures.
+SAMPLINGS = {
+    "none": None,
+    "anti-aliased": (0.0, 0.0, 0.0),
+    "same": (0.9, 1.1, 1.0),
+    "half size": (0.9, 1.1, 0.25),
+    "double size": (0.9, 1.1, 4.0),
+    "from nearer": (0.4, 0.6, 1.0),
+    "from farther": (1.5, 2.0, 1.0),
+    "from both": (0.8, 1.0, 1.0),
+}
+samplings = pytest.mark.parametrize("sampling", SAMPLINGS.values(), ids=SAMPLINGS)
+
+
+def sampling_of(splats: RawSplats, camera: Camera, sampling: Any) -> ViewSampling | None:
+    if sampling is None:
+        return None
+    nearest, farthest, size = sampling
+    distance = (splats.means.detach() - camera.to(dtype=torch.float64).position).norm(dim=1)
+    spread = torch.linspace(0.8, 1.2, len(distance), dtype=torch.float64)  # some are within, some are not
+    return ViewSampling(torch.stack([nearest * spread * distance, farthest * spread * distance]), size)
+
+
+@samplings
+def test_splats_lie_where_the_reference_puts_them(sampling: Any) -> None:
     splats, camera = scene()
     (_, _, z), *expected = reference.image_axes(splats.means, splats.quats, splats.scales, camera)
     torch.testing.assert_close(axes(splats, camera), torch.stack(expected), **CLOSE)
@@ -52,15 +76,17 @@ def test_splats_lie_where_the_reference_puts_them(antialiased: bool | None) -> N
     screen = *camera.intrinsics[2:], camera.width, camera.height, camera.near
     shape = splats.quats.unbind(1), splats.scales.unbind(1)
     logits = splats.opacities
-    seen, record, first, last, radius = f.footprint(view_of(camera), screen, point, *shape, logits, antialiased)
-    if antialiased:
-        splats = reference.compensated(splats, camera)
-        assert (splats.opacities < logits).any()
-    expected = reference.project(splats, camera)
+    trained = sampling_of(splats, camera, sampling)
+    of_kernel = None if trained is None else (*trained.distances, trained.size)
+    seen, record, first, last, radius = f.footprint(view_of(camera), screen, point, *shape, logits, of_kernel)
+    if trained is not None:
+        splats = reference.compensated(splats, camera, trained)
+        assert sampling[2] >= 1 or (splats.opacities < logits - 0.1).any()
+    expected = reference.project(splats, camera, trained)
     x, y, a, b, c, log2_opacity, depth, slope_x, slope_y = record
     torch.testing.assert_close(torch.stack([x, y], 1), expected.means2d, **CLOSE)
     torch.testing.assert_close(depth, expected.depths, **CLOSE)
-    rows = reference.visible(splats, camera)
+    rows = reference.visible(splats, camera, trained)
     torch.testing.assert_close(log2_opacity.exp2()[rows], splats.opacities.sigmoid()[rows], **CLOSE)
     # The factor times itself is the inverse covariance in the binary exponent.
     conics = torch.stack([a * a, a * b, b * b + c * c], 1) * (2 / formulas.LOG2_E)
@@ -108,21 +134,23 @@ def test_gradient_of_a_quaternion() -> None:
     torch.testing.assert_close(torch.stack(f.quaternion_gradient(unit, inverse, rows), 1), expected, **CLOSE)
 
 
-@pytest.mark.parametrize("antialiased", [None, True])
-def test_gradients_of_the_geometry(antialiased: bool | None) -> None:
+@samplings
+def test_gradients_of_the_geometry(sampling: Any) -> None:
     splats, camera = scene()
     moments, h, centre, g_depth = random(40, 3), random(40) + 1, random(40, 2), random(40)
     leaves = [splats.means, splats.quats, splats.scales]
     for leaf in leaves:
         leaf.requires_grad_()
     (_, _, z), u, v = reference.image_axes(*leaves, camera)
-    projected = reference.project(splats, camera)
+    trained = sampling_of(splats, camera, sampling)
+    of_kernel = None if trained is None else (*trained.distances, trained.size)
+    projected = reference.project(splats, camera, trained)
     # Moments are those of h·uuᵀ with u = F·(x - centre), so that dL/dΣ⁻¹ = -½ Σ h (x - centre)(x - centre)ᵀ.
     view = view_of(camera)
     point = f.view_point(view, splats.means.detach().unbind(1))
     screen = *camera.intrinsics[2:], camera.width, camera.height, camera.near
     shape = splats.quats.detach().unbind(1), splats.scales.detach().unbind(1)
-    _, record, *_ = f.footprint(view, screen, point, *shape, splats.opacities, antialiased)
+    _, record, *_ = f.footprint(view, screen, point, *shape, splats.opacities, of_kernel)
     factor = record[2:5]
     a, b, c = factor
     zero = torch.zeros_like(a)
@@ -130,13 +158,12 @@ def test_gradients_of_the_geometry(antialiased: bool | None) -> None:
     S = torch.stack([moments[:, :2], moments[:, 1:]], 1)
     g_covariance = F.mT @ S @ F * (formulas.MOMENT_SCALE / 2)
     U = torch.stack([u, v], 1)
-    loss = (g_covariance * (U @ U.mT)).sum() + (projected.means2d * centre).sum() + (z * g_depth).sum()
-    if antialiased:
-        loss = loss + (h * reference.light_kept(splats, camera, torch.arange(40)).log()).sum()
+    blurred = U @ U.mT + reference.blur_of(splats, camera, trained)[:, None, None] * torch.eye(2)
+    loss = (g_covariance * blurred).sum() + (projected.means2d * centre).sum() + (z * g_depth).sum()
+    if trained is not None:
+        loss = loss + (h * reference.light_kept(splats, camera, torch.arange(40), trained).log()).sum()
     expected = torch.autograd.grad(loss, leaves)
-    found = f.geometry_backward(
-        view, point, *shape, factor, moments.unbind(1), h, centre.unbind(1), g_depth, antialiased
-    )
+    found = f.geometry_backward(view, point, *shape, factor, moments.unbind(1), h, centre.unbind(1), g_depth, of_kernel)
     for ours, theirs in zip(found, expected, strict=True):
         torch.testing.assert_close(torch.stack(ours, 1), theirs, rtol=1e-4, atol=1e-6)
 

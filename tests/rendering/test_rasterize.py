@@ -17,6 +17,7 @@ from nsvq_lightning.rendering.cpu import rasterizer
 from nsvq_lightning.rendering.cpu.records import MAX_SIDE
 from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.rendering.reference import light_kept
+from nsvq_lightning.rendering.sampling import ViewSampling
 from nsvq_lightning.skips import switched
 from nsvq_lightning.splats.splats import RawSplats, Splats
 
@@ -349,7 +350,8 @@ def test_the_factor_is_that_of_the_determinants() -> None:
     )
     along = camera.intrinsics[1] / camera.intrinsics[0]
     expected = math.prod((size / (size + 0.3)) ** 0.5 for size in (pixels**2, (pixels * along) ** 2))
-    assert float(light_kept(splats, camera, torch.tensor([0]))) == pytest.approx(expected, rel=1e-3)
+    none_kept = ViewSampling(torch.zeros(2, 1), 0.0)
+    assert float(light_kept(splats, camera, torch.tensor([0]), none_kept)) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
@@ -371,12 +373,13 @@ def test_pictures_are_alike_at_half_and_double_resolution(factor: float) -> None
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-def test_broken_and_huge_splats_do_no_harm_to_anti_aliasing(backend: str) -> None:
+@pytest.mark.parametrize("sampling", [None, 1e-30, 1e30, 40.0])
+def test_broken_and_huge_splats_do_no_harm_to_sampling(backend: str, sampling: float | None) -> None:
     camera, splats = front_camera(), random_splats(40)
     splats.means[0], splats.scales[1], splats.quats[2] = torch.nan, 40.0, 0.0
     splats.opacities[3], splats.opacities[4], splats.scales[5] = 60.0, -60.0, -60.0
     splats.means[6] = -splats.means[6] * 10
     dtype = torch.float32 if backend == "cpu" else torch.float64
-    result, gradients = run(splats, camera, backend, dtype, antialiased=True)
+    result, gradients = run(splats, camera, backend, dtype, antialiased=sampling is None, sampling=sampling)
     assert result.image.isfinite().all()
     assert all(gradient[1:].isfinite().all() for gradient in gradients.values())

@@ -26,6 +26,7 @@ from nsvq_lightning.rendering.cuda.binning import list_tiles
 from nsvq_lightning.rendering.cuda.blend import SLOTS, blend, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens, project
 from nsvq_lightning.rendering.rasterize import render, visible
+from nsvq_lightning.rendering.sampling import Sampling, focal_of
 from nsvq_lightning.splats.splats import RawSplats
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
@@ -105,6 +106,16 @@ def test_a_colour_that_is_no_number_shows() -> None:
 def test_anti_aliasing(log_scale: float) -> None:
     splats, camera = random_splats(24, log_scale=log_scale), front_camera(16, 12)
     ours, _ = assert_same(splats, camera, antialiased=True)
+    plain = render(on_device(splats), camera, backend="cuda").image.detach().cpu()
+    assert (plain - ours.image).abs().max() > 0.01
+
+
+@pytest.mark.parametrize("times", [0.4, 1.0, 3.0])
+def test_sampling(times: float) -> None:
+    splats, camera = random_splats(24, log_scale=-3.5), front_camera(16, 12)
+    away = (splats.means - camera.position).norm(dim=1)
+    sampling = Sampling(away * torch.linspace(0.5, 1.5, 24), 1.2 * away, [focal_of(camera) / times])
+    ours, _ = assert_same(splats, camera, sampling=sampling)
     plain = render(on_device(splats), camera, backend="cuda").image.detach().cpu()
     assert (plain - ours.image).abs().max() > 0.01
 

@@ -34,6 +34,7 @@ from nsvq_lightning.rendering.cuda.binning import Tiles, tiles_of
 from nsvq_lightning.rendering.cuda.blend import blend, blend_backward, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens
 from nsvq_lightning.rendering.cuda.records import RECORD
+from nsvq_lightning.rendering.sampling import ViewSampling
 
 TARGET = GPUTarget("cuda", 90, 32)
 SPLATS, SEEN, PAIRS, WIDTH, HEIGHT = 1000, 800, 3000, 100, 60
@@ -52,11 +53,11 @@ def attributes() -> tuple[torch.Tensor, ...]:
     return tuple(tensor(*shape) for shape in shapes)
 
 
-def project(degree: int, antialiased: bool | None = None) -> None:
+def project(degree: int, sampling: ViewSampling | None = None) -> None:
     records, boxes = tensor(SPLATS, RECORD.value), tensor(SPLATS, 4, dtype=torch.int32)
-    projection._launch_projection(lens(), attributes(), degree, antialiased, records, boxes, tensor(SPLATS, 2))
+    projection._launch_projection(lens(), attributes(), degree, sampling, records, boxes, tensor(SPLATS, 2))
     ids, rows = tensor(SEEN, dtype=torch.int64), tensor(SEEN, RECORD.value)
-    projection.project_backward(lens(), attributes(), degree, ids, rows, rows, tensor(SPLATS, 2), antialiased)
+    projection.project_backward(lens(), attributes(), degree, ids, rows, rows, tensor(SPLATS, 2), sampling)
 
 
 def tiles() -> Tiles:
@@ -100,7 +101,7 @@ CASES: dict[str, Callable[[], object]] = {
     "radii": lambda: projection.project_radii(lens(), attributes()),
     "project_0": lambda: project(0),
     "project_3": lambda: project(3),
-    "project_antialiased": lambda: project(3, antialiased=True),
+    "project_sampled": lambda: project(3, ViewSampling(tensor(2, SPLATS), 0.25)),
     "tiles": lambda: tiles_of(tensor(SEEN, 4, dtype=torch.int32), tensor(SEEN, dtype=torch.int32), PAIRS, 7, 4),
     "blend": lambda: render(everything=False),
     "blend_and_observe": lambda: render(everything=True),

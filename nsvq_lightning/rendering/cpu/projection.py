@@ -43,8 +43,11 @@ def load_shapes(quats, scales, logits, start, count, scratch):
 
 
 @inline
-def project_range(camera, antialiased, means, quats, scales, logits, first, last, records, integers, ids, scratch):
-    """Write the records of a range's visible splats; returns how many there are and how many slots they need."""
+def project_range(camera, sampling, means, quats, scales, logits, first, last, records, integers, ids, scratch):
+    """Write the records of a range's visible splats; returns how many there are and how many slots they need.
+
+    ``sampling`` are nearest and farthest distances, with 16 numbers more, and the size, or None.
+    """
     zero = simd.broadcast(0)
     visible = 0
     slots = 0
@@ -57,7 +60,10 @@ def project_range(camera, antialiased, means, quats, scales, logits, first, last
         if simd.mask_bits(point[2] > simd.load_one(camera, rec.NEAR)) & lanes == 0:
             continue
         quat, scale, logit = load_shapes(quats, scales, logits, start, count, scratch)
-        seen, record, corner, end, radius = footprint(view, load_screen(camera), point, quat, scale, logit, antialiased)
+        trained_at = None
+        if sampling is not None:
+            trained_at = simd.load(sampling[0], start), simd.load(sampling[1], start), simd.broadcast(sampling[2])
+        seen, record, corner, end, radius = footprint(view, load_screen(camera), point, quat, scale, logit, trained_at)
         bits = simd.mask_bits(seen) & lanes
         if bits == 0:
             continue
@@ -90,12 +96,12 @@ def project_range(camera, antialiased, means, quats, scales, logits, first, last
 
 @parallel
 def project_splats(
-    thread, threads, camera, antialiased, means, quats, scales, logits, records, integers, found, counts, slots, scratch
+    thread, threads, camera, sampling, means, quats, scales, logits, records, integers, found, counts, slots, scratch
 ):
     """Write the records of all visible splats; ``found`` gets a run of rows for each thread's range."""
     first, last = rec.vector_share(logits.shape[0], thread, threads)
     counts[thread], slots[thread] = project_range(
-        camera, antialiased, means, quats, scales, logits, first, last, records, integers, found, scratch[thread]
+        camera, sampling, means, quats, scales, logits, first, last, records, integers, found, scratch[thread]
     )
 
 

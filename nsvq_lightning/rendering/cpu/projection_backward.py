@@ -24,13 +24,14 @@ def clear_rows(first, last, stride, gradients):
 
 @parallel
 def project_backward(
-    thread, threads, camera, antialiased, geometry, shN, bands, ids, count, records, integers, sums, g_means2d,
+    thread, threads, camera, sampling, geometry, shN, bands, ids, count, records, integers, sums, g_means2d,
     gradients, scratch,
 ):  # fmt: skip
     """Gradients of all raw attributes from the sums of the slots of the visible splats; 0 for the others.
 
     ``sums[16·slot]`` of a splat's first slot holds its total; ``g_means2d [N·2]`` the gradient of its projected centre.
-    ``geometry`` are means, quaternions, log-scales and logits, ``bands`` as in ``add_colors``.
+    ``geometry`` are means, quaternions, log-scales and logits, ``bands`` as in ``add_colors``, ``sampling`` as in
+    ``project_range``.
     """
     means, quats, scales, logits = geometry
     g_means, g_quats, g_scales, g_logits, g_sh0, g_shN = gradients
@@ -67,9 +68,13 @@ def project_backward(
         view = rec.load_view(camera)
         factor = record[rec.A : rec.LOG2_OPACITY]
         moments = total[rec.SUM_UU : rec.SUM_DEPTH]
+        trained_at = None
+        if sampling is not None:
+            nearest, farthest = simd.gather_rows1(sampling[0], ids, start), simd.gather_rows1(sampling[1], ids, start)
+            trained_at = nearest[0], farthest[0], simd.broadcast(sampling[2])
         g_mean, g_quat, g_scale = formulas.geometry_backward(
             view, formulas.view_point(view, mean), quat, scale, factor, moments, total[rec.SUM_H], (g2x, g2y),
-            total[rec.SUM_DEPTH], antialiased,
+            total[rec.SUM_DEPTH], trained_at,
         )  # fmt: skip
         colors = record[rec.RED : rec.DEPTH]
         rgb = formulas.unclamped(colors, total[rec.SUM_RED : rec.SUM_H])

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn.functional import pad
 
 from nsvq_lightning.compute.jit import thread_count
 from nsvq_lightning.compute.memory import Array, Workspace, flat, flat_checked, recycled
@@ -13,6 +14,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import binning, projection, projection_backward
 from nsvq_lightning.rendering.cpu import blend as blending
 from nsvq_lightning.rendering.cpu import records as rec
+from nsvq_lightning.rendering.sampling import ViewSampling
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats
@@ -23,9 +25,13 @@ PROJECTION_SCRATCH = 2048 + 64
 class _Frame:
     """One view of the splats on its way through the stages; holds its workspace for as long as it lives."""
 
-    def __init__(self, splats: RawSplats, camera: Camera, degree: int, antialiased: bool | None) -> None:
+    def __init__(self, splats: RawSplats, camera: Camera, degree: int, sampling: ViewSampling | None) -> None:
         self.camera = rec.pack_camera(camera)
-        self.antialiased = antialiased
+        self.sampling = None
+        if sampling is not None:
+            # Kernels read whole vectors.
+            nearest, farthest = pad(sampling.distances, (0, 16))
+            self.sampling = flat(nearest), flat(farthest), np.float32(sampling.size)
         self.size = width, height = camera.width, camera.height
         self.group_columns, group_rows = rec.group_grid(width, height)
         self.tiles = self.group_columns * group_rows * rec.GROUP_TILES
@@ -52,7 +58,7 @@ class _Frame:
         found = self.work.array("found", self.n, np.int32)
         counts, slots = (self.work.array(name, self.threads, np.int64) for name in ("counts", "slot_counts"))
         projection.project_splats(
-            self.threads, self.camera, self.antialiased, *self.geometry, self.records, self.integers, found, counts,
+            self.threads, self.camera, self.sampling, *self.geometry, self.records, self.integers, found, counts,
             slots, self.scratch,
         )  # fmt: skip
         return found, counts, slots
@@ -139,7 +145,7 @@ class _Project(torch.autograd.Function):
         _check_kept(ctx.saved_tensors, ctx.shapes)
         gradients = [recycled(shape) for shape in ctx.shapes]
         projection_backward.project_backward(
-            frame.threads, frame.camera, frame.antialiased, frame.geometry, frame.colors[1], frame.bands, frame.ids,
+            frame.threads, frame.camera, frame.sampling, frame.geometry, frame.colors[1], frame.bands, frame.ids,
             frame.count, frame.records, frame.integers, frame.sums, flat(g_means2d),
             tuple(map(flat, gradients)), frame.scratch,
         )  # fmt: skip
@@ -203,7 +209,7 @@ def render(
     background: Tensor,
     pixel_weights: Tensor | None,
     absgrad: Tensor | None,
-    antialiased: bool | None,
+    sampling: ViewSampling | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
@@ -213,7 +219,7 @@ def render(
         ValueError: The attributes do not fit together, or the image is too large.
         TypeError: An attribute is not float32.
     """
-    frame = _Frame(splats, camera, sh_degree, antialiased)
+    frame = _Frame(splats, camera, sh_degree, sampling)
     means2d, token, radii = _Project.apply(frame, *splats)
     image, alpha, depth = _Blend.apply(frame, means2d, token, background, pixel_weights, absgrad)
     return image, alpha, radii, means2d, depth

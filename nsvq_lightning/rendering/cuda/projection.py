@@ -15,6 +15,7 @@ from nsvq_lightning.rendering import formulas as shared
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda import records as rec
 from nsvq_lightning.rendering.cuda.harmonics import color, color_backward, load_row, store_row
+from nsvq_lightning.rendering.sampling import ViewSampling
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 
 formulas = for_triton(shared)
@@ -23,6 +24,8 @@ SLOPES, NEAR = tl.constexpr(15), tl.constexpr(19)
 
 # Splats per program.
 BLOCK = 128
+# What kernels are given where splats are rendered as they are.
+NO_SAMPLING = None, None
 
 
 @triton.jit
@@ -46,14 +49,24 @@ def load_geometry(means, quats, scales, row, mask):
     return load_row(means + 3 * row, 3, mask), load_row(quats + 4 * row, 4, mask), load_row(scales + 3 * row, 3, mask)
 
 
+@triton.jit
+def load_sampling(distances, size, row, n, mask):
+    """The sampling of the rows, whose ``distances`` are ``[2, n]``; None stays None."""
+    if distances is None:
+        return None
+    else:
+        nearest = tl.load(distances + row, mask=mask, other=1.0)
+        return nearest, tl.load(distances + n + row, mask=mask, other=1.0), size
+
+
 # Passed as the SH degree where no record is wanted.
 RADIUS_ONLY = -1
 
 
 @triton.jit(do_not_specialize=["n"])
 def project_kernel(
-    means, quats, scales, logits, sh0, shN, view, fx, fy, cx, cy, width, height, n, stride,
-    records, boxes, means2d, radii, DEGREE: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
+    means, quats, scales, logits, sh0, shN, view, fx, fy, cx, cy, width, height, n, stride, distances, size,
+    records, boxes, means2d, radii, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Records, tile boxes and centres of the splats in view at their own rows; radii, 0 for the rest."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -63,7 +76,8 @@ def project_kernel(
     camera = load_view(view, fx, fy)
     screen = (cx, cy, width, height, tl.load(view + NEAR))
     point = formulas.view_point(camera, mean)
-    seen, record, first, last, radius = formulas.footprint(camera, screen, point, quat, scale, logit, ANTIALIASED)
+    trained_at = load_sampling(distances, size, row, n, inside)
+    seen, record, first, last, radius = formulas.footprint(camera, screen, point, quat, scale, logit, trained_at)
     seen = inside & seen
     radius = tl.minimum(radius, 1e9)
     tl.store(radii + row, tl.where(seen, radius, 0.0).to(tl.int32), mask=inside)
@@ -81,9 +95,9 @@ def project_kernel(
 
 @triton.jit(do_not_specialize=["n"])
 def project_backward_kernel(
-    means, quats, scales, logits, shN, view, fx, fy, cx, cy, width, height, n, ranks, records, totals, g_means2d,
-    g_means, g_quats, g_scales, g_logits, g_sh0, g_shN,
-    STRIDE: tl.constexpr, DEGREE: tl.constexpr, ANTIALIASED: tl.constexpr, BLOCK: tl.constexpr,
+    means, quats, scales, logits, shN, view, fx, fy, cx, cy, width, height, n, distances, size, ranks, records, totals,
+    g_means2d, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN,
+    STRIDE: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Gradients of all attributes from the moments (``totals``, one slot each) of the splats in view.
 
@@ -102,7 +116,7 @@ def project_backward_kernel(
     g_mean, g_quat, g_scale = formulas.geometry_backward(
         camera, (x, y, tl.where(seen, z, 1.0)), quat, scale, load_row(record + rec.A, 3, seen),
         load_row(total + rec.SUM_UU, 3, seen), h, centre, tl.load(total + rec.SUM_DEPTH, mask=seen, other=0.0),
-        ANTIALIASED,
+        load_sampling(distances, size, row, n, seen),
     )  # fmt: skip
     store_row(g_scales + 3 * row, g_scale, inside)
     store_row(g_quats + 4 * row, g_quat, inside)
@@ -174,30 +188,32 @@ class Projected(NamedTuple):
     boxes: Tensor
 
 
-def _check_attributes(lens: Lens, attributes: tuple[Tensor, ...]) -> None:
+def _check_attributes(lens: Lens, attributes: tuple[Tensor, ...], sampling: ViewSampling | None) -> None:
     n, device, coefficients = len(attributes[0]), attributes[0].device, attributes[-1].shape[1]
     check_tensor("lens.view", lens.view, (20,), device)
     shapes = (n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, coefficients, 3)
     for name, attribute, shape in zip(ATTRIBUTES, attributes, shapes, strict=True):
         check_tensor(name, attribute, shape, device)
+    if sampling is not None:
+        check_tensor("sampling", sampling.distances, (2, n), device)
 
 
 def _launch_projection(
     lens: Lens,
     attributes: tuple[Tensor, ...],
     degree: int,
-    antialiased: bool | None,
+    sampling: ViewSampling | None,
     records: Tensor,
     boxes: Tensor,
     means2d: Tensor,
 ) -> Tensor:
     n, shN = attributes[0].shape[0], attributes[-1]
-    _check_attributes(lens, attributes)
+    _check_attributes(lens, attributes, sampling)
     radii = torch.zeros(n, dtype=torch.int32, device=shN.device)
     if n:
         project_kernel[(triton.cdiv(n, BLOCK),)](
-            *attributes, *lens, n, 3 * shN.shape[1], records, boxes, means2d, radii,
-            DEGREE=degree, ANTIALIASED=antialiased, BLOCK=BLOCK, **COMPILE,
+            *attributes, *lens, n, 3 * shN.shape[1], *(sampling or NO_SAMPLING), records, boxes, means2d, radii,
+            DEGREE=degree, BLOCK=BLOCK, **COMPILE,
         )  # fmt: skip
     return radii
 
@@ -213,14 +229,14 @@ def project_radii(lens: Lens, attributes: tuple[Tensor, ...]) -> Tensor:
     return _launch_projection(lens, attributes, RADIUS_ONLY, None, unused, unused, unused)
 
 
-def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int, antialiased: bool | None = None) -> Projected:
+def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int, sampling: ViewSampling | None = None) -> Projected:
     """Project all splats and list those in view.
 
     Args:
         lens: The camera.
         attributes: The six raw attributes, contiguous float32, in the order of :class:`~nsvq_lightning.RawSplats`.
         degree: Highest SH degree that is evaluated, at most the stored one.
-        antialiased: Whether with anti-aliasing; None for not.
+        sampling: How the splats were trained, or None.
 
     Raises:
         ValueError: The tensors do not fit together.
@@ -231,7 +247,7 @@ def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int, antialiased
     records = means.new_empty(n, rec.RECORD.value)
     boxes = torch.empty(n, 4, dtype=torch.int32, device=means.device)
     means2d = means.new_zeros(n, 2)
-    radii = _launch_projection(lens, attributes, degree, antialiased, records, boxes, means2d)
+    radii = _launch_projection(lens, attributes, degree, sampling, records, boxes, means2d)
     ids = radii.nonzero()[:, 0]
     ids = ids[records[ids, rec.DEPTH.value].sort(stable=True).indices]
     return Projected(means2d, radii, ids, records[ids], boxes[ids])
@@ -245,7 +261,7 @@ def project_backward(
     records: Tensor,
     totals: Tensor,
     g_means2d: Tensor,
-    antialiased: bool | None = None,
+    sampling: ViewSampling | None = None,
 ) -> list[Tensor]:
     """Gradients of the six attributes, 0 for splats not in view.
 
@@ -257,13 +273,13 @@ def project_backward(
         records: Their records ``[V, RECORD]``.
         totals: Their summed moments ``[V, RECORD]``.
         g_means2d: Gradient of the projected centres ``[N, 2]``.
-        antialiased: As in :func:`project`.
+        sampling: As in :func:`project`.
 
     Raises:
         ValueError: The tensors do not fit together.
         TypeError: A dtype is wrong.
     """
-    _check_attributes(lens, attributes)
+    _check_attributes(lens, attributes, sampling)
     device = attributes[0].device
     check_tensor("ids", ids, (len(ids),), device, torch.int64)
     check_tensor("records", records, (len(ids), rec.RECORD.value), device)
@@ -276,7 +292,8 @@ def project_backward(
     ranks[ids] = torch.arange(len(ids), dtype=torch.int32, device=device)
     if n:
         project_backward_kernel[(triton.cdiv(n, BLOCK),)](
-            means, quats, scales, logits, shN, *lens, n, ranks, records, totals, g_means2d, *gradients,
-            STRIDE=3 * shN.shape[1], DEGREE=degree, ANTIALIASED=antialiased, BLOCK=BLOCK, **COMPILE,
+            means, quats, scales, logits, shN, *lens, n, *(sampling or NO_SAMPLING), ranks, records, totals, g_means2d,
+            *gradients,
+            STRIDE=3 * shN.shape[1], DEGREE=degree, BLOCK=BLOCK, **COMPILE,
         )  # fmt: skip
     return gradients

@@ -10,6 +10,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.binning import Tiles, list_tiles
 from nsvq_lightning.rendering.cuda.blend import blend, blend_backward, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens, project, project_backward, project_radii
+from nsvq_lightning.rendering.sampling import ViewSampling
 from nsvq_lightning.splats.splats import RawSplats
 
 
@@ -17,9 +18,9 @@ class _Project(torch.autograd.Function):
     """Raw attributes to centres, radii and records; the gradient of a record is its moments, see ``records``."""
 
     @staticmethod
-    def forward(ctx: Any, lens: Lens, degree: int, antialiased: bool | None, *attributes: Tensor) -> tuple[Tensor, ...]:
-        projected = project(lens, attributes, degree, antialiased)
-        ctx.lens, ctx.degree, ctx.antialiased = lens, degree, antialiased
+    def forward(ctx: Any, lens: Lens, degree: int, sampling: ViewSampling | None, *attributes: Tensor) -> Any:
+        projected = project(lens, attributes, degree, sampling)
+        ctx.lens, ctx.degree, ctx.sampling = lens, degree, sampling
         ctx.save_for_backward(projected.ids, projected.records, *attributes)
         ctx.mark_non_differentiable(projected.radii, projected.ids, projected.boxes)
         ctx.set_materialize_grads(False)
@@ -32,7 +33,7 @@ class _Project(torch.autograd.Function):
         moments = torch.zeros_like(records) if moments is None else moments.contiguous()
         g_means2d = records.new_zeros(len(attributes[0]), 2) if g_means2d is None else g_means2d.contiguous()
         gradients = project_backward(
-            ctx.lens, tuple(attributes), ctx.degree, ids, records, moments, g_means2d, ctx.antialiased
+            ctx.lens, tuple(attributes), ctx.degree, ids, records, moments, g_means2d, ctx.sampling
         )
         return None, None, None, *gradients
 
@@ -72,7 +73,7 @@ def render(
     background: Tensor,
     pixel_weights: Tensor | None,
     absgrad: Tensor | None,
-    antialiased: bool | None,
+    sampling: ViewSampling | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
@@ -80,7 +81,7 @@ def render(
     """
     with torch.cuda.device_of(splats.means):
         lens = Lens.of(camera, splats.means.device)
-        means2d, radii, ids, records, boxes = _Project.apply(lens, sh_degree, antialiased, *splats)
+        means2d, radii, ids, records, boxes = _Project.apply(lens, sh_degree, sampling, *splats)
         image, alpha, depth = _Blend.apply(lens, means2d, ids, records, boxes, background, pixel_weights, absgrad)
     return image, alpha, radii, means2d, depth
 
