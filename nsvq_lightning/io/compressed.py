@@ -10,6 +10,7 @@ import numpy as np
 
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.numbers import opacity_of
+from nsvq_lightning.rendering.sampling import Sampling, fewer_cameras
 from nsvq_lightning.splats import attributes as splat
 from nsvq_lightning.splats.conventions import Arrays, Bools, Float32s, Float64s, Integers, shN_degree, unit
 
@@ -39,6 +40,8 @@ class CompressedScene:
         origin: World coordinates of the point that is 0 in ``means``, float64.
         stored_bytes: Bytes of the file the scene was read from, None if it was not.
         bases: Bases ``[C, D]`` float32 by attribute, C from 1 to D; only ``shN`` may have one.
+        cameras: Positions, relative to ``origin``, and focal lengths in pixels of the cameras of training ``[C, 4]``,
+            C ≤ :data:`nsvq_lightning.rendering.sampling.MAX_CAMERAS`; none where they are not known.
 
     Raises:
         ValueError: Shapes do not fit each other, a code is not a row of its codebook, or an attribute is missing or
@@ -57,6 +60,7 @@ class CompressedScene:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     stored_bytes: int | None = None
     bases: Mapping[str, Float32s] = field(default_factory=dict)
+    cameras: Float64s = field(default_factory=lambda: np.zeros((0, 4)))
 
     def __post_init__(self) -> None:
         n = len(self.means)
@@ -81,6 +85,8 @@ class CompressedScene:
             _check_floats(f"bases[{name!r}]", basis, (max(1, min(len(basis), dims[name])), dims[name]))
         for name, codes in self.codes.items():
             _check_codes(name, codes, self.codebooks[name], n, dims[name])
+        if self.cameras.shape[1:] != (4,) or not (np.isfinite(self.cameras).all() and (self.cameras[:, 3] > 0).all()):
+            raise ValueError("cameras must be rows of a position and a focal length above 0, all finite")
 
     @classmethod
     def from_splats(cls, splats: "SplatTensors", **header: Any) -> "CompressedScene":
@@ -154,9 +160,9 @@ class CompressedScene:
                 codebooks[name] = np.concatenate(books)
             else:
                 raw[name] = np.concatenate([scene.rows(name) for scene in scenes])
-        means = [scene.means + np.subtract(scene.origin, first.origin) for scene in scenes]
+        scenes = [scene.relative_to(first.origin) for scene in scenes]
         return cls(
-            np.concatenate(means).astype(np.float32),
+            np.concatenate([scene.means for scene in scenes]),
             np.concatenate([scene.opacities for scene in scenes]),
             codes,
             codebooks,
@@ -164,6 +170,7 @@ class CompressedScene:
             sh_degree=degree,
             config=first.config,
             origin=first.origin,
+            cameras=fewer_cameras(np.concatenate([scene.cameras for scene in scenes])),
         )
 
     def __len__(self) -> int:
@@ -173,6 +180,14 @@ class CompressedScene:
     def antialiased(self) -> bool:
         """Whether it is to be rendered with anti-aliasing, as it was trained (``antialiased`` of :attr:`config`)."""
         return self.config.get("antialiased") is True
+
+    def sampling(self) -> Sampling | None:
+        """How the cameras of training saw the decoded splats; None where they are not known, or with anti-aliasing."""
+        import torch
+
+        if self.antialiased or len(self.cameras) == 0:
+            return None
+        return Sampling.of(torch.from_numpy(self.means), self.cameras)
 
     def rows(self, name: str, splats: slice = slice(None)) -> Float32s:
         """An attribute ``[N, D]`` of all splats or some, bit for bit the rows of its codebook if it has one.
@@ -257,7 +272,8 @@ class CompressedScene:
         if self.origin == origin:
             return self
         means = self.means.astype(np.float64) + self.origin - origin
-        return replace(self, means=means.astype(np.float32), origin=origin)
+        cameras = self.cameras + np.append(np.subtract(self.origin, origin), 0)
+        return replace(self, means=means.astype(np.float32), origin=origin, cameras=cameras)
 
     def finite(self) -> "CompressedScene":
         """The splats without NaN or infinite values; a warning counts the others by attribute.

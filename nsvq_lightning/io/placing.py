@@ -83,6 +83,8 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     has_origin = any(scene.origin)
     means = scene.means.astype(np.float64) @ linear.T + (0 if has_origin else shift)
     origin = linear @ np.array(scene.origin) + (shift if has_origin else 0)
+    cameras = scene.cameras.copy()
+    cameras[:, :3] = cameras[:, :3] @ linear.T + (0 if has_origin else shift)
     return scene.changed(
         {
             "scales": lambda rows: rows + np.log(size),
@@ -91,6 +93,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
         },
         means=means.astype(np.float32),
         origin=tuple(origin.tolist()),
+        cameras=cameras,
     )
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from compressed_scenes import arrays_of, scene_of
 from compressed_scenes import scene as coded
 from viewer_scenes import plain_scene
 
-from nsvq_lightning.io.compressed import attribute_errors
+from nsvq_lightning.io.compressed import CompressedScene, attribute_errors
 
 
 def test_a_crop_keeps_codebooks_and_what_is_inside() -> None:
@@ -23,6 +25,21 @@ def test_a_crop_keeps_codebooks_and_what_is_inside() -> None:
         expected = scene.codebooks[name][scene.codes[name][inside]]
         np.testing.assert_array_equal(small.codebooks[name][small.codes[name]], expected)
         assert len(small.codebooks[name]) == len(np.unique(part.codes[name]))
+
+
+def test_joined_scenes_have_the_cameras_of_all() -> None:
+    parts = [
+        replace(coded(20, origin=(shift, 0.0, 0.0)), cameras=np.array([[0.0, 1.0, 2.0, 500.0], [9.0, 0, 0, 600.0]]))
+        for shift in (3.0, 5.0)
+    ]
+    joined = CompressedScene.joined(parts)
+    assert joined.origin == (3, 0, 0)
+    assert joined.cameras.tolist() == [[0, 1, 2, 500], [9, 0, 0, 600], [2, 1, 2, 500], [11, 0, 0, 600]]
+    moved = joined.relative_to((1.0, -1.0, 0.0))
+    assert moved.cameras[1].tolist() == [11, 1, 0, 600]
+    assert parts[0].sampling() is not None
+    assert replace(parts[0], config={"antialiased": True}).sampling() is None
+    assert coded(20).sampling() is None
 
 
 def test_known_changes_are_found() -> None:

@@ -37,7 +37,11 @@ def test_a_turned_scene_is_the_same_scene(degree: int, kind: str) -> None:
     if kind == "basis" and degree:
         scene = on_basis(plain)
     rotation = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    scene = replace(scene, cameras=np.array([[1.5, 0.0, -3.0, 700.0], [0.1, 0.2, 0.3, 50.0]]))
     turned = rotated(scene, rotation)
+    world = scene.cameras[:, :3] + scene.origin
+    np.testing.assert_allclose(turned.cameras[:, :3] + turned.origin, world @ rotation.T)
+    np.testing.assert_array_equal(turned.cameras[:, 3], scene.cameras[:, 3])
     assert [len(rows) for rows in turned.codebooks.values()] == [len(rows) for rows in scene.codebooks.values()]
     if scene.bases:
         expanded = replace(scene, raw={name: scene.rows(name) for name in scene.raw}, bases={})

@@ -63,6 +63,14 @@ def check(header, streams):
     assert type(origin) is list
     assert len(origin) == 3
     assert all(number(value) and math.isfinite(value) for value in origin)
+    cameras = header.get("cameras", [])
+    assert type(cameras) is list
+    assert len(cameras) <= 64
+    for camera in cameras:
+        assert type(camera) is list
+        assert len(camera) == 4
+        assert all(number(value) and math.isfinite(value) for value in camera)
+        assert camera[3] > 0
     assert type(header["config"]) is dict
     assert type(metrics) is dict
     assert all(value is None or number(value) for value in metrics.values())

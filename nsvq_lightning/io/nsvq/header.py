@@ -17,10 +17,14 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_type_hints
 
+import numpy as np
+
 from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, Json, naming_file
+from nsvq_lightning.rendering.sampling import MAX_CAMERAS
 from nsvq_lightning.splats.attributes import attribute_dims
+from nsvq_lightning.splats.conventions import Float64s
 
 # Magic, BLAKE2b digest of everything after it, version, and bytes of the JSON, whose keys are sorted, without spaces.
 _PREFIX = struct.Struct("<8s16sII")
@@ -88,6 +92,7 @@ class Header:
         streams: Stream table; the streams follow each other without gaps.
         config: Settings of the run; JSON values.
         metrics: Quality measured on the decoded file; None stands for NaN or infinity.
+        cameras: Positions, relative to ``origin``, and focal lengths in pixels of the cameras of training, rounded.
     """
 
     level: str
@@ -98,6 +103,7 @@ class Header:
     streams: tuple[StreamEntry, ...]
     config: Json = field(default_factory=dict)
     metrics: dict[str, float | None] = field(default_factory=dict)
+    cameras: tuple[tuple[float, ...], ...] = ()
 
     @classmethod
     def of(
@@ -106,12 +112,14 @@ class Header:
         """Header of the file of a scene."""
         x, y, z = map(float, scene.origin)
         config, metrics = dict(scene.config), dict(scene.metrics)
-        return cls(level, len(scene), scene.sh_degree, (x, y, z), entries, streams, config, metrics)
+        cameras = _rounded(scene.cameras)
+        return cls(level, len(scene), scene.sh_degree, (x, y, z), entries, streams, config, metrics, cameras)
 
     @property
     def of_scene(self) -> Json:
-        """What a scene has from its header as it is."""
-        return {name: getattr(self, name) for name in ("sh_degree", "config", "metrics", "origin")}
+        """What a scene has from its header."""
+        same = {name: getattr(self, name) for name in ("sh_degree", "config", "metrics", "origin")}
+        return same | {"cameras": np.array(self.cameras, np.float64).reshape(-1, 4)}
 
     @property
     def size(self) -> int:
@@ -148,6 +156,8 @@ class Header:
         """
         try:
             table = asdict(self)
+            if not self.cameras:
+                del table["cameras"]
             for name, value in self.metrics.items():
                 table["metrics"][name] = None if value is None or not math.isfinite(value) else value
             text = json.dumps(table, sort_keys=True, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
@@ -175,6 +185,7 @@ class Header:
             streams=tuple(_row(StreamEntry, row) for row in _entry(table, "streams", list)),
             config=_entry(table, "config", dict),
             metrics=_entry(table, "metrics", dict),
+            cameras=_cameras(_entry({"cameras": [], **table}, "cameras", list)),
         )
         if header.sh_degree > 3:
             raise FormatError(f"damaged: SH degree {header.sh_degree}, the highest is 3")
@@ -209,12 +220,34 @@ def _row(kind: type[_T], row: object) -> _T:
 
 
 def _origin(values: list[Any]) -> tuple[float, float, float]:
-    # Comparing is safe; float() of a huge integer would overflow.
-    finite = (type(value) in _NUMBERS and abs(value) <= sys.float_info.max for value in values)
-    if len(values) != 3 or not all(finite):
+    if not _are_numbers(values, 3):
         raise FormatError("damaged: header entry 'origin' must be three finite numbers")
     x, y, z = map(float, values)
     return x, y, z
+
+
+def _cameras(rows: list[Any]) -> tuple[tuple[float, ...], ...]:
+    if len(rows) > MAX_CAMERAS or not all(_are_numbers(row, 4) and row[3] > 0 for row in rows):
+        raise FormatError(f"damaged: header entry 'cameras' must be at most {MAX_CAMERAS} positions and focal lengths")
+    return tuple(tuple(map(float, row)) for row in rows)
+
+
+def _are_numbers(values: Any, count: int) -> bool:
+    # Comparing is safe; float() of a huge integer would overflow.
+    return (
+        isinstance(values, list)
+        and len(values) == count
+        and all(type(value) in _NUMBERS and abs(value) <= sys.float_info.max for value in values)
+    )
+
+
+def _rounded(cameras: Float64s) -> tuple[tuple[float, ...], ...]:
+    """Cameras ``[C, 4]`` with the digits that count: positions to about a hundredth of their spread."""
+    if len(cameras) == 0:
+        return ()
+    spread = float(np.ptp(cameras[:, :3], axis=0).max()) or 1.0
+    decimals = 2 - math.floor(math.log10(spread))
+    return tuple((*(round(x, decimals) for x in place), float(f"{focal:.4g}")) for *place, focal in cameras.tolist())
 
 
 def frame(header: Header, streams: Mapping[str, bytes]) -> list[bytes]:

@@ -133,6 +133,9 @@
     if (level !== "compact" && level !== "paper") refuse(`its level ${level} is unknown`);
     if (!natural(splats) || !natural(degree) || degree > 3) refuse("its header lacks the number of splats or the SH degree");
     if (!Array.isArray(origin) || origin.length !== 3 || !origin.every(Number.isFinite)) refuse("its origin is not three numbers");
+    const { cameras = [] } = header;
+    const fits = row => Array.isArray(row) && row.length === 4 && row.every(Number.isFinite) && row[3] > 0;
+    if (!Array.isArray(cameras) || cameras.length > 64 || !cameras.every(fits)) refuse("its cameras are not positions and focal lengths");
     if (!isTable(header.config) || !isTable(header.metrics)) refuse("its header lacks the settings or the metrics");
     if (!Object.values(header.metrics).every(value => value === null || typeof value === "number")) refuse("its metrics are not numbers");
     const attributes = rowsOf(header.attributes, ["name", "dim", "storage", "codes", "step"]);

@@ -3,6 +3,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from nsvq_lightning import io
 from nsvq_lightning.io import CompressedScene, FormatError, read_header, read_nsvq
 from nsvq_lightning.io.nsvq.file import pack_fields, unpack_fields
-from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
 
 write_nsvq = partial(io.write_nsvq, storage=Storage("paper"))
@@ -136,6 +137,12 @@ def test_forged_headers_are_refused_before_anything_is_allocated(tmp_path: Path)
         (lambda h: h.update(origin=[0, 0]), "origin"),
         (lambda h: h.update(origin=[0, 0, 10**400]), "origin"),
         (lambda h: h.update(splats=4), "stream table"),
+        (lambda h: h.update(cameras={}), "'cameras' must be of type list"),
+        (lambda h: h.update(cameras=[[0, 0, 0]]), "at most 64 positions and focal lengths"),
+        (lambda h: h.update(cameras=[[0, 0, 0, 0]]), "at most 64 positions"),
+        (lambda h: h.update(cameras=[[0, 0, 10**400, 1]]), "at most 64 positions"),
+        (lambda h: h.update(cameras=[[0, 0, True, 1]]), "at most 64 positions"),
+        (lambda h: h.update(cameras=65 * [[0, 0, 0, 1]]), "at most 64 positions"),
     ],
 )
 def test_forged_tables(tmp_path: Path, change: Callable[[dict[str, Any]], object], message: str) -> None:
@@ -207,6 +214,23 @@ def test_wrong_scenes_are_refused_at_construction() -> None:
         broken(sh_degree=4)
     with pytest.raises(ValueError, match="no coefficients at SH degree 0"):
         scene(5, {"shN": 2}, degree=0)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 5e4])
+def test_cameras_are_kept_with_the_digits_that_count(tmp_path: Path, unit: float, level: str) -> None:
+    path = tmp_path / "x.nsvq"
+    cameras = np.random.default_rng(0).normal(size=(64, 4)) * [unit, unit, unit, 0] + [0, unit, 0, 1234.5678]
+    bare = io.write_nsvq(path, scene(30), Storage(level))
+    assert "cameras" not in json.loads(read_header(path).to_json())
+    assert len(read_nsvq(path).cameras) == 0
+    added = io.write_nsvq(path, replace(scene(30), cameras=cameras), Storage(level)) - bare
+    back = read_nsvq(path)
+    np.testing.assert_allclose(back.cameras[:, :3], cameras[:, :3], rtol=0, atol=0.01 * unit)
+    assert set(back.cameras[:, 3]) == {1235.0}
+    assert added < 64 * 35
+    io.write_nsvq(tmp_path / "y.nsvq", back, Storage(level))
+    np.testing.assert_array_equal(read_nsvq(tmp_path / "y.nsvq").cameras, back.cameras)
 
 
 def test_settings_must_be_json_and_metrics_may_be_infinite(tmp_path: Path) -> None:

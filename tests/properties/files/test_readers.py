@@ -166,6 +166,11 @@ def test_flipped_bits_and_short_files_are_noticed(tmp_path: Path) -> None:
         (lambda header: header["streams"][0].__setitem__(1, 10**9), "longer than the file"),
         (lambda header: header["streams"][-1].__setitem__(1, 0), "bytes follow"),
         (lambda header: header.update(splats=21), "does not end with its last number"),
+        (lambda header: header.update(cameras=None), "cameras are not positions and focal lengths"),
+        (lambda header: header.update(cameras=[[0, 0, 0]]), "cameras are not positions"),
+        (lambda header: header.update(cameras=[[0, 0, 0, -1]]), "cameras are not positions"),
+        (lambda header: header.update(cameras=[[0, 0, True, 1]]), "cameras are not positions"),
+        (lambda header: header.update(cameras=65 * [[0, 0, 0, 1]]), "cameras are not positions"),
     ],
 )
 def test_a_header_that_cannot_be_is_refused(tmp_path: Path, change: Any, words: str) -> None:
@@ -219,6 +224,10 @@ CHANGES: dict[str, tuple[Any, str]] = {
     "UTF-16": (lambda p: _with_text(p, lambda t: t.decode().encode("utf-16-le")), "not JSON"),
     "no config": (lambda p: forge(p, lambda h: h.pop("config")), "config"),
     "metrics of words": (lambda p: forge(p, lambda h: h["metrics"].update(psnr="high")), "metrics"),
+    "a camera of 3 numbers": (lambda p: forge(p, lambda h: h.update(cameras=[[0, 0, 0]])), "cameras"),
+    "a camera without a lens": (lambda p: forge(p, lambda h: h.update(cameras=[[0, 0, 0, 0]])), "cameras"),
+    "no list of cameras": (lambda p: forge(p, lambda h: h.update(cameras=None)), "cameras"),
+    "many cameras": (lambda p: forge(p, lambda h: h.update(cameras=65 * [[0, 0, 0, 1]])), "cameras"),
     "many splats": (lambda p: forge(p, lambda h: h.update(splats=2**18 + 1)), "262145 splats cannot be in"),
     "many rows": (
         lambda p: forge(p, lambda h: h["attributes"][3].__setitem__(3, 2**16 + 1)),
