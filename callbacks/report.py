@@ -19,6 +19,7 @@ from nsvq_lightning.io.nsvq.file import paper_header, read_nsvq
 from nsvq_lightning.io.nsvq.header import Header
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
+from nsvq_lightning.rendering.sampling import Sampling
 from nsvq_lightning.report import numbers, page, pictures
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
@@ -84,6 +85,7 @@ class MetricReport(WritingCallback):
         self._scene: CompressedScene | None = None
         self._paper: Header
         self._scores: list[dict[str, Any]] = []
+        self._sampling: Sampling | None = None
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
         self._beside = TimesBeside()
@@ -186,6 +188,7 @@ class MetricReport(WritingCallback):
             self._scene = read_nsvq(path)
         # Detached tensors, not the module: a submodule would enter checkpoints.
         module.evaluation_splats = module.frame.splats(self._scene.decode().to(module.device))
+        self._sampling = module.frame.sampling(self._scene.sampling())
         self._lpips, self._lpips_reason = build_lpips() if self.lpips else (None, "switched off")
         if self._lpips is not None:
             self._lpips.to(module.device)
@@ -194,7 +197,8 @@ class MetricReport(WritingCallback):
         self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int, dataloader_idx: int = 0
     ) -> None:
         """Keep the scores of one view and write its picture."""
-        if self._scene is None:
+        splats = module.evaluation_splats
+        if self._scene is None or splats is None:
             return
         image, photo = outputs["image"], eight_bit(batch.image)
         lpips = None
@@ -202,6 +206,10 @@ class MetricReport(WritingCallback):
             lpips = float(self._lpips(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]))
         corrected = apply_mask(eight_bit(color_corrected(image, photo, batch.mask)), batch.mask)
         score = {"name": batch.name, "psnr": float(outputs["psnr"]), "ssim": float(outputs["ssim"]), "lpips": lpips}
+        for name, times in numbers.SMALLER.items():
+            small = batch.smaller(min(times, *photo.shape[:2]))
+            shown = module.scene.render(splats, small.camera, sampling=self._sampling).image
+            score[name] = float(psnr(eight_bit(shown), eight_bit(small.image), small.mask))
         score["cc_psnr"] = float(psnr(corrected, photo, batch.mask))
         score["cc_ssim"] = float(ssim(corrected, photo, batch.mask))
         self._scores.append(score)

@@ -13,6 +13,7 @@ import torch
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
+from nsvq_lightning.rendering.sampling import Sampling
 from nsvq_lightning.splats.conventions import Float32s, Float64s
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
@@ -74,6 +75,12 @@ class Frame:
             moved = Camera(camera.K.double(), torch.from_numpy(view), camera.width, camera.height, near)
             known[self] = moved.to(dtype=torch.float32)
         return known[self]
+
+    def sampling(self, sampling: Sampling | None) -> Sampling | None:
+        """The sampling of splats of the files, here."""
+        if sampling is None:
+            return None
+        return sampling._replace(nearest=sampling.nearest / self.unit, farthest=sampling.farthest / self.unit)
 
     def splats(self, splats: SplatTensors) -> RawSplats:
         """Splats of the files, here; detached."""

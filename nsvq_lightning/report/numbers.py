@@ -27,6 +27,8 @@ from nsvq_lightning.training.schedule import Phase
 
 Values = Mapping[str, Any]
 Rows = Sequence[Values]
+# How many times smaller pictures are compared, too, by the name of their PSNR.
+SMALLER = {"psnr_half": 2, "psnr_quarter": 4}
 
 
 @torch.no_grad()
@@ -77,12 +79,13 @@ def summarize(
     Args:
         path: The file that was decoded.
         scene: The decoded scene.
-        scores: Row of each test view in ``views.csv``: its name, ``psnr``, ``ssim``, ``cc_psnr`` and ``cc_ssim``.
+        scores: Row of each test view in ``views.csv``: its name, ``psnr``, ``ssim``, those of :data:`SMALLER`,
+            ``cc_psnr`` and ``cc_ssim``.
         lpips: Mean LPIPS and None, or None and the reason.
         module: The module, for its history and schedule.
         paper: Header of the scene that was stored at level ``paper``, with the bytes of the paper's formula.
     """
-    scored = "psnr", "ssim", "cc_psnr", "cc_ssim"
+    scored = "psnr", "ssim", *SMALLER, "cc_psnr", "cc_ssim"
     file_bytes = path.stat().st_size
     header = read_header(path)
     plain_bytes = plain_ply_bytes(len(scene), scene.sh_degree)

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any, Literal, Self, cast
 
+import numpy as np
 import torch
 from lightning.pytorch import LightningModule
 from lightning.pytorch.utilities.model_helpers import _restricted_classmethod
@@ -27,6 +28,7 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.rendering.rasterize import Render, visible
+from nsvq_lightning.rendering.sampling import trained_by
 from nsvq_lightning.splats.splats import Splats, SplatTensors, detached
 from nsvq_lightning.training import distributed, optim, resume, run_scene
 from nsvq_lightning.training.schedule import Phase, Schedule
@@ -113,6 +115,8 @@ class SplatModule(LightningModule):
         self.save_hyperparameters(ignore=["splats"])
         self.frame = Frame()
         """Coordinates of the splats; the module is given cameras, and makes files, in those of the files."""
+        self.cameras = np.zeros((0, 4))
+        """Of training ``[C, 4]``, as files keep them (:func:`nsvq_lightning.rendering.sampling.trained_by`)."""
         self.extent = 0.0
         """Of the cameras, in units of the frame; 0 while unknown."""
         self.schedule = Schedule()
@@ -162,6 +166,7 @@ class SplatModule(LightningModule):
             background=self.background,
             antialiased=self.antialiased,
             backend=self.backend,
+            cameras=self.cameras,
         )
 
     def compressed(self) -> CompressedScene:
@@ -230,6 +235,8 @@ class SplatModule(LightningModule):
             self.background = run_scene.background_of(scene, self.background)
         if stage != "fit":
             return
+        if scene is not None:
+            self.cameras = trained_by([scene.cameras[index] for index in scene.train])
         if scene is not None and self.frame == Frame():
             self.frame = scene.frame
             # Splats that were given came with the coordinates of the files.
@@ -379,6 +386,7 @@ class SplatModule(LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add history, schedule, quantizers and scene; plain data only, so that ``weights_only=True`` can read it."""
         checkpoint["history"] = self.history
+        checkpoint["cameras"] = self.cameras.tolist()
         checkpoint["schedule"] = asdict(self.schedule)
         checkpoint[resume.QUANTIZER_SETTINGS] = self.quantizer_settings
         scene = run_scene.scene_of(self._trainer)
@@ -401,6 +409,7 @@ class SplatModule(LightningModule):
             resume.check_scene(checkpoint, scene)
         self.history = list(checkpoint["history"])
         if self._trainer is None or self._trainer.state.fn != "fit":
+            self.cameras = np.reshape(checkpoint.get("cameras", []), (-1, 4))
             self.schedule = Schedule(**checkpoint["schedule"])
             return
         self.schedule = resume.continued_schedule(checkpoint, self.schedule)

@@ -2,9 +2,10 @@
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,6 +17,7 @@ from nsvq_lightning.quantize.codebook import Quantizer
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.rendering.rasterize import Render, render
+from nsvq_lightning.splats.conventions import Float64s
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, detached, sh_degree_of
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.version import __version__
@@ -40,6 +42,8 @@ class SplatScene:
     antialiased: bool
     backend: str
     """Rasterizer, see :func:`nsvq_lightning.render`."""
+    cameras: Float64s = field(default_factory=lambda: np.zeros((0, 4)))
+    """Cameras of training ``[C, 4]`` that files keep, see :attr:`CompressedScene.cameras`."""
 
     def rows(self, attribute: str) -> Tensor:
         """Rows ``[N, D]`` of a quantized attribute, detached."""
@@ -97,4 +101,4 @@ class SplatScene:
         }
         if self.antialiased:
             told["antialiased"] = True
-        return placed(replace(scene, config=told), self.frame)
+        return replace(placed(replace(scene, config=told), self.frame), cameras=self.cameras)
