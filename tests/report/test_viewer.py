@@ -7,6 +7,7 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import quote
@@ -24,6 +25,7 @@ from nsvq_lightning.io.formats import read_scene, save
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.rendering.sampling import focal_of
 from nsvq_lightning.report import viewer
 from nsvq_lightning.report.viewer import write_viewer
 from nsvq_lightning.splats.splats import RawSplats
@@ -191,7 +193,8 @@ def _psnr(tab: Page, scene_file: Path, camera: Camera) -> float:
     """PSNR in dB of what the page draws against this package's own picture, both of 8 bits."""
     picture = base64.b64decode(tab.run("nsvqViewer.picture()").split(",")[1])
     drawn, scene = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")), read_scene(scene_file)
-    image = render(scene.decode(), camera, background=torch.tensor(BACKGROUND), antialiased=scene.antialiased).image
+    how = {"antialiased": scene.antialiased, "sampling": scene.sampling()}
+    image = render(scene.decode(), camera, background=torch.tensor(BACKGROUND), **how).image
     expected = (image.clamp(0, 1) * 255).round().numpy()
     return float(10 * np.log10(255**2 / np.square(drawn - expected).mean()))
 
@@ -218,6 +221,26 @@ def test_anti_aliasing_is_what_the_file_says(tab: Page, tmp_path: Path) -> None:
         assert _psnr(tab, tmp_path / f"{antialiased}.nsvq", camera) > 55
         assert _psnr(tab, tmp_path / "False.nsvq", camera) > 55 or antialiased
     assert _psnr(tab, tmp_path / "False.nsvq", camera) < 40
+
+
+@needs_chromium
+@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+def test_blur_has_the_size_of_training(tab: Page, tmp_path: Path, times: float) -> None:
+    """At other sizes, and from nearer and farther than the cameras of training."""
+    camera = _cameras()["front"]
+    focal, x, y, z = focal_of(camera), *camera.packed_view[12:]
+    small = CompressedScene.from_splats(_splats()._replace(scales=_splats().scales - 1))
+    save(small, tmp_path / "plain.nsvq")
+    stretch = torch.diag(torch.tensor([times, times, 1.0]))
+    enlarged = Camera(stretch @ camera.K, camera.viewmat, int(96 * times), int(64 * times))
+    for shift in (0.0, -1.5, 4.0):
+        scene = replace(small, cameras=np.array([[x, y, z + shift, focal]]))
+        save(scene, tmp_path / "scene.nsvq")
+        write_viewer(tmp_path / "viewer.html", tmp_path / "scene.nsvq", {"front": camera}, "t", BACKGROUND)
+        _shown(tab, (tmp_path / "viewer.html").as_uri(), enlarged.width, enlarged.height)
+        assert _psnr(tab, tmp_path / "scene.nsvq", enlarged) > 48
+        same = times == 1 and shift == 0
+        assert same or _psnr(tab, tmp_path / "plain.nsvq", enlarged) < 44
 
 
 @needs_chromium

@@ -1,8 +1,8 @@
 // A viewer of 3D Gaussian splats in WebGL 2, without dependencies. The page around it holds a .nsvq file (#file, base64),
 // its reader (#decoder, the global `nsvq`) and cameras, background and up direction (#scene, JSON).
 //
-// Pictures are those of nsvq_lightning/rendering: the same projection, blur and cut-offs, with one difference: a pixel is
-// not finished when its transmittance falls below 1e-4, as blending goes from back to front.
+// Pictures are those of nsvq_lightning/rendering: the same projection, blur, sampling and cut-offs, with one difference: a
+// pixel is not finished when its transmittance falls below 1e-4, as blending goes from back to front.
 //
 // Cameras have COLMAP's axes inside: x right, y down, z forward. JSON has nerfstudio's: x right, y up, z backward.
 "use strict";
@@ -30,9 +30,32 @@ function rowsFor(count) {
   return Math.floor(count / ROW) + 1;
 }
 
-/** From what the file stores to what is drawn, in place: opacities, axis lengths, unit quaternions. */
+/**
+ * Distance of each splat from the nearest and from the farthest camera of training, as one number: two of 12 bits, logarithms
+ * in steps of 1.1 %. Between cameras there have been others: distances reach as much farther as cameras are apart.
+ */
+function trainedFrom(count, means, cameras) {
+  const apart = cameras.map((a) => Math.min(...cameras.map((b) => (a === b ? Infinity : Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2])))));
+  const gap = cameras.length > 1 ? apart.sort((a, b) => a - b)[(cameras.length - 1) >> 1] : 0;
+  const code = (distance, round) => Math.min(4095, Math.max(0, round(64 * (Math.log2(distance) + 24))));
+  const distances = new Float32Array(count);
+  for (let i = 0; i < count; i++) {
+    let nearest = Infinity, farthest = 0;
+    for (const [x, y, z] of cameras) {
+      const dx = means[3 * i] - x, dy = means[3 * i + 1] - y, dz = means[3 * i + 2] - z, squared = dx * dx + dy * dy + dz * dz;
+      nearest = Math.min(nearest, squared);
+      farthest = Math.max(farthest, squared);
+    }
+    nearest = Math.sqrt(nearest);
+    distances[i] = 4096 * code(Math.max(nearest - gap, nearest / 2), Math.floor) + code(Math.sqrt(farthest) + gap, Math.ceil);
+  }
+  return distances;
+}
+
+/** From what the file stores to what is drawn, in place: opacities, axis lengths, unit quaternions; and distances of training. */
 function activate(splats) {
-  const { count, opacities, scales, quats } = splats;
+  const { count, means, opacities, scales, quats, header } = splats;
+  splats.distances = trainedFrom(count, means, header.cameras ?? []);
   for (let i = 0; i < count; i++) {
     opacities[i] = 1 / (1 + Math.exp(-opacities[i]));
     const q = quats.subarray(4 * i, 4 * i + 4), norm = Math.hypot(...q);
@@ -104,7 +127,7 @@ function serve() {
 /** `{decode(buffer), sort(direction, share), end()}`, promises but the last: in a worker, or here where the browser allows none. */
 async function startEngine(decoderSource) {
   try {
-    const source = [`"use strict"; const ROW = ${ROW};`, decoderSource, rowsFor, activate, descending, makeSorter, `(${serve})();`].join("\n");
+    const source = [`"use strict"; const ROW = ${ROW};`, decoderSource, rowsFor, trainedFrom, activate, descending, makeSorter, `(${serve})();`].join("\n");
     const worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
     const waiting = [];
     const reply = () => new Promise((resolve, reject) => waiting.push({ resolve, reject }));
@@ -173,9 +196,12 @@ void main() {
   colour = vec4(max(sum, 0.0), 1);
 }`;
 
-/** A rectangle along the axes of each splat's ellipse, as large as the area where its opacity reaches 1/255. */
-/** Draws the splats; with `antialiased`, opacities shrink as the blur enlarges the ellipse, as the scene was trained. */
-const SPLAT = (antialiased) => `#version 300 es
+/**
+ * A rectangle along the axes of each splat's ellipse, as large as the area where its opacity reaches 1/255. The blur of 0.3
+ * square pixels belongs to the pixels of training, and there are `ratio` as many here: more is added where that is above 1, and
+ * opacities shrink where it is below. With "antialiased", none of the blur was trained; "plain" does not know.
+ */
+const SPLAT = (trained) => `#version 300 es
 precision highp float;
 precision highp int;
 precision highp sampler2DArray;
@@ -187,6 +213,7 @@ uniform vec3 translation;
 uniform vec2 size;         // of the picture, pixels
 uniform vec4 lens;         // fx, fy, cx, cy, pixels
 uniform float near;        // nothing is seen before it
+uniform float enlarged;    // (focal length here / in training)^2
 flat out vec4 colour;      // opacity last
 out vec2 offset;           // from the centre, standard deviations along the axes of the ellipse
 
@@ -196,7 +223,7 @@ void main() {
   int index = int(texelFetch(order, ivec2(place % ${ROW}, place / ${ROW}), 0).r);
   ivec2 at = ivec2(index % ${ROW}, index / ${ROW});
   vec4 mean = texelFetch(geometry, ivec3(at, 0), 0), q = texelFetch(geometry, ivec3(at, 1), 0);
-  vec3 deviations = texelFetch(geometry, ivec3(at, 2), 0).xyz;
+  vec4 deviations = texelFetch(geometry, ivec3(at, 2), 0);
   vec3 centre = rotation * mean.xyz + translation;
   float z = centre.z, reach = 2.0 * log(mean.w * 255.0);
   if (!(z > near) || !(reach > 0.0)) return;
@@ -211,13 +238,20 @@ void main() {
   vec3 u = lens.x / z * (axes[0] - slope.x * axes[2]), v = lens.y / z * (axes[1] - slope.y * axes[2]);
   float xx = dot(u, u), xy = dot(u, v), yy = dot(v, v);
   if (!(xx + yy < 1e18)) return;
-  vec3 area = cross(u, v);  // |u x v|^2 = xx yy - xy^2, without its loss of digits
-  float determinant = dot(area, area) + 0.3 * (xx + yy) + 0.09;
-  float opacity = mean.w * ${antialiased ? "sqrt(dot(area, area) / determinant)" : "1.0"};
+  float ratio = ${{ plain: "1.0", antialiased: "0.0", sampled: "enlarged" }[trained]};
+#if ${Number(trained === "sampled")}
+  vec2 trained = exp2(vec2(floor(deviations.w / 4096.0), mod(deviations.w, 4096.0)) / 64.0 - 24.0);
+  float away = length(centre), times = clamp(away, trained.x, trained.y) / away;
+  ratio *= times * times;
+#endif
+  float added = 0.3 * max(ratio, 1.0), kept = 0.3 * ratio;
+  vec3 normal = cross(u, v);  // |u x v|^2 = xx yy - xy^2, without its loss of digits
+  float area = dot(normal, normal), determinant = area + added * (xx + yy + added), opacity = mean.w;
+  if (ratio < 1.0) opacity *= sqrt((area + kept * (xx + yy + kept)) / determinant);
   reach = 2.0 * log(opacity * 255.0);
   if (!(reach > 0.0)) return;
   float half_difference = 0.5 * (xx - yy), root = length(vec2(half_difference, xy));
-  float longest = 0.5 * (xx + yy) + 0.3 + root;
+  float longest = 0.5 * (xx + yy) + added + root;
   vec2 axis = half_difference >= 0.0 ? vec2(half_difference + root, xy) : vec2(xy, root - half_difference);
   axis = root > 0.0 ? normalize(axis) : vec2(1, 0);
 
@@ -268,7 +302,10 @@ class Renderer {
     this.#upload(splats);
     this.colours = this.#target(2, ROW, this.rows);
     this.colour = this.#program(FULL_SCREEN, COLOUR(splats.shDegree), { geometry: 0, harmonics: 1 });
-    this.splat = this.#program(SPLAT(splats.header.config?.antialiased === true), BLEND, { geometry: 0, colours: 2, order: 4 });
+    const { config, cameras = [] } = splats.header;
+    this.focals = config?.antialiased === true ? [] : cameras.map((camera) => camera[3]);
+    const trained = config?.antialiased === true ? "antialiased" : cameras.length ? "sampled" : "plain";
+    this.splat = this.#program(SPLAT(trained), BLEND, { geometry: 0, colours: 2, order: 4 });
     this.show = this.#program(FULL_SCREEN, SHOW, { picture: 3 });
     const corners = Uint16Array.from({ length: 6 * GROUP }, (_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 2, 1, 3][k % 6]);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
@@ -295,8 +332,8 @@ class Renderer {
     for (const { program } of [this.colour, this.splat, this.show]) this.gl.deleteProgram(program);
   }
 
-  /** Geometry as float32: centre and opacity, rotation, axes. Harmonics as float16: a layer for each coefficient. */
-  #upload({ count, means, opacities, quats, scales, sh0, shN, shDegree }) {
+  /** Geometry as float32: centre and opacity, rotation, axes and distances of training. Harmonics as float16: a layer for each coefficient. */
+  #upload({ count, means, opacities, quats, scales, distances, sh0, shN, shDegree }) {
     const gl = this.gl;
     const layer = (channels, parts) => {
       const texels = new Float32Array(ROW * this.rows * channels);
@@ -320,7 +357,8 @@ class Renderer {
       gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
     };
     const centres = [{ values: means, width: 3 }, { values: opacities, width: 1, at: 3 }];
-    texture(0, gl.RGBA32F, 4, [centres, [{ values: quats, width: 4 }], [{ values: scales, width: 3 }]]);
+    const sizes = [{ values: scales, width: 3 }, { values: distances, width: 1, at: 3 }];
+    texture(0, gl.RGBA32F, 4, [centres, [{ values: quats, width: 4 }], sizes]);
     const higher = (shDegree + 1) ** 2 - 1;
     const harmonics = [[{ values: sh0, width: 3 }]];
     for (let k = 0; k < higher; k++) harmonics.push([{ values: shN, width: 3, stride: 3 * higher, from: 3 * k }]);
@@ -356,7 +394,7 @@ class Renderer {
     }
     gl.useProgram(program);
     for (const [name, slot] of Object.entries(samplers)) gl.uniform1i(gl.getUniformLocation(program, name), slot);
-    const names = ["eye", "rotation", "translation", "size", "lens", "near", "scale"];
+    const names = ["eye", "rotation", "translation", "size", "lens", "near", "enlarged", "scale"];
     const at = Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]));
     return { program, at };
   }
@@ -367,6 +405,13 @@ class Renderer {
     this.drawn = order.length;
     gl.activeTexture(gl.TEXTURE4);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, order.length / ROW, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
+  }
+
+  /** (Focal length / that of the most similar photos)^2; less than one percent does not count. */
+  #enlarged(focal) {
+    const off = (ratio) => Math.abs(Math.log(ratio));
+    const ratio = this.focals.reduce((best, other) => (off(focal / other) < off(best) ? focal / other : best), Infinity);
+    return off(ratio) < 0.01 ? 1 : ratio * ratio;
   }
 
   /** Draw what a camera (`view` below) sees over `background`, with `share` of the canvas's resolution. */
@@ -399,6 +444,7 @@ class Renderer {
     gl.uniform2f(this.splat.at.size, ...size);
     gl.uniform4f(this.splat.at.lens, fx * sx, fy * sy, cx * sx, cy * sy);
     gl.uniform1f(this.splat.at.near, near);
+    gl.uniform1f(this.splat.at.enlarged, this.#enlarged(Math.sqrt(fx * sx * fy * sy)));
     gl.enable(gl.BLEND);
     gl.drawElementsInstanced(gl.TRIANGLES, 6 * GROUP, gl.UNSIGNED_SHORT, 0, this.drawn / GROUP);
     gl.disable(gl.BLEND);
