@@ -1,9 +1,11 @@
 """What the arguments of commands stand for: lists, numbers, and scenes with the photos behind them."""
 
 import argparse
+import logging
 import math
 import re
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -12,8 +14,12 @@ from nsvq_lightning.commands.settings import settings_of, values_by_name
 
 if TYPE_CHECKING:
     from nsvq_lightning.data.scene import Scene
+    from nsvq_lightning.io.compressed import CompressedScene
     from nsvq_lightning.rendering.camera import Camera
     from nsvq_lightning.splats.splats import SplatTensors
+
+
+log = logging.getLogger(__name__)
 
 
 class Parser(argparse.ArgumentParser):
@@ -121,11 +127,19 @@ def photos_of(path: Path) -> Path | None:
     Raises:
         ValueError: Beside it is a ``config.yaml`` that is no table of settings.
     """
-    root = values_by_name(settings_of([str(_run_of(path) / "config.yaml")])).get("data.root")
+    root = _settings_of_run(path).get("data.root")
     if not root:
         return None
     folder = Path(root).expanduser()
     return folder if folder.is_dir() else None
+
+
+def _number(text: str) -> int | None:
+    return int(text) if text.isdigit() else None
+
+
+def _settings_of_run(path: Path) -> dict[str, str]:
+    return values_by_name(settings_of([str(_run_of(path) / "config.yaml")]))
 
 
 def _run_of(path: Path) -> Path:
@@ -134,11 +148,20 @@ def _run_of(path: Path) -> Path:
 
 
 def _trained_on(path: Path, root: Path | None) -> "Scene | None":
-    """The scene folder ``root``, or else that of the photos that a scene file was trained on, if they are known."""
+    """The scene folder ``root``, or else that of the photos that a scene file was trained on, if they are known.
+
+    Photos of a run have the size that it has trained with.
+    """
     from nsvq_lightning.data.scene import load_scene
 
-    root = root or photos_of(path)
-    return None if root is None else load_scene(root)
+    if root is not None:
+        return load_scene(root)
+    folder = photos_of(path)
+    if folder is None:
+        return None
+    settings = _settings_of_run(path)
+    factor, width = (settings.get(f"data.{name}", "") for name in ("factor", "max_width"))
+    return load_scene(folder, _number(factor), _number(width or "1600"))  # type: ignore[arg-type]
 
 
 def cameras_of(path: Path, root: Path | None) -> "dict[str, Camera]":
@@ -168,6 +191,30 @@ def cameras_of(path: Path, root: Path | None) -> "dict[str, Camera]":
         if (place / CAMERAS).is_file():
             return read_cameras(place / CAMERAS)
     return {}
+
+
+def trained_scene(path: Path, root: Path | None, near: Path | None = None) -> "CompressedScene":
+    """A scene with the cameras of its training, where these are known: its own, or those of :func:`cameras_of`.
+
+    Args:
+        path: Scene file.
+        root: Scene folder whose photos it was trained on.
+        near: What else the cameras are looked for with, such as the folder of a run.
+
+    Raises:
+        SceneError: The folder is not a scene.
+        ValueError: The scene, or what a run has recorded, is damaged.
+    """
+    from nsvq_lightning.io.formats import read_scene
+    from nsvq_lightning.rendering.sampling import trained_by
+
+    scene = read_scene(path)
+    if len(scene.cameras):
+        return scene
+    cameras = list(cameras_of(near or path, root).values())
+    if cameras:
+        log.info("%s: blur and size are those of %d cameras that it was trained by", path, len(cameras))
+    return replace(scene, cameras=trained_by(cameras))
 
 
 def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -> "tuple[list[Camera], Scene | None]":

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import add_root, positive, views_of
+from nsvq_lightning.commands.arguments import add_root, positive, trained_scene, views_of
 from nsvq_lightning.io.atomic import write_bytes
 from nsvq_lightning.io.formats import FORMATS
 from nsvq_lightning.io.lod import NAME
@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
         ValueError: The scene cannot be used, or a limit cannot be met.
         OSError: A file cannot be read or written.
     """
-    from nsvq_lightning.io.formats import read_scene, suffix_of
+    from nsvq_lightning.io.formats import suffix_of
 
     streamed = suffix_of(options.output) == NAME
     wrong = ""
@@ -110,7 +110,7 @@ def run(options: argparse.Namespace) -> int:
         wrong = f"--levels is for {NAME}, but the output is {options.output}"
     if wrong:
         raise argparse.ArgumentError(None, wrong)
-    scene = read_scene(options.input)
+    scene = trained_scene(options.input, options.root)
     most = splats_left(options.splats, len(scene))
     from nsvq_lightning.commands.compressor import Compressor, setting_for
     from nsvq_lightning.compression.viewpoints import Measure, own_scene

@@ -325,7 +325,7 @@ class Compressor:
                 checkpoint=None,
             )
             self._fit(module, SplatTrainer(max_steps=steps, callbacks=callbacks, enable_checkpointing=False))
-        found = replace(module.compressed().finite(), origin=self.scene.origin)
+        found = replace(module.compressed().finite(), origin=self.scene.origin, cameras=self.scene.cameras)
         del module
         trim()
         return found

@@ -21,7 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import add_root, views_of
+from nsvq_lightning.commands.arguments import add_root, trained_scene, views_of
 from nsvq_lightning.commands.compress import VIEWS, share_or_number, splats_left, written_error
 from nsvq_lightning.io import formats, lod, placing, spz
 from nsvq_lightning.io.compressed import CompressedScene, attribute_errors
@@ -80,7 +80,10 @@ def run(options: argparse.Namespace) -> int:
     entry = formats.format_of(output)
     if not output.parent.is_dir() and formats.suffix_of(output) != lod.NAME:
         raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
-    scene = _edited(CompressedScene.joined([formats.read_scene(path) for path in options.inputs]), options)
+    read = formats.read_scene
+    if formats.suffix_of(output) == ".nsvq":  # other formats keep no cameras
+        read = partial(trained_scene, root=options.root)
+    scene = _edited(CompressedScene.joined([read(path) for path in options.inputs]), options)
     writer = {"palette": options.palette, "version": options.spz_version, "axes": options.spz_axes}
     given = {name: value for name, value in writer.items() if value is not None}
     size = formats.save(scene, output, Storage(options.level) if options.level else None, **given)
@@ -117,7 +120,7 @@ def _contradiction(options: argparse.Namespace) -> str:
         return "--align moves the cameras of a scene folder: add --data.root"
     if options.up and not (options.up_from or options.root):
         return "--up needs to know where up is now: add --data.root or --up-from"
-    if options.root and not uses_photos:
+    if options.root and not uses_photos and formats.suffix_of(options.output) != ".nsvq":
         return "--data.root says where to measure: add --measure"
     if options.measure and (moves or options.crop or options.floaters or options.splats or len(options.inputs) > 1):
         return "--measure compares with the input as it is: convert without it first"

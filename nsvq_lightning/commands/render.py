@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import add_root, cameras_of, positive, scene_file
+from nsvq_lightning.commands.arguments import add_root, cameras_of, positive, scene_file, trained_scene
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
@@ -79,7 +79,6 @@ def run(options: argparse.Namespace) -> int:
     import torch
 
     from nsvq_lightning.compute.devices import best_device
-    from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.report.pictures import VIDEO, frame_writer
 
@@ -88,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
     is_video = output.suffix.lower() == VIDEO
     if output.suffix and not is_video:
         raise ValueError(f"{output}: name a video ({VIDEO}), or a folder for PNGs")
-    scene = read_scene(file)
+    scene = trained_scene(file, options.root, options.scene)
     splats = scene.decode()
     cameras, fps = _path(options, splats, is_video)
     device = best_device()
@@ -97,6 +96,7 @@ def run(options: argparse.Namespace) -> int:
         render,
         background=torch.tensor(options.background, device=device),
         antialiased=scene.antialiased,
+        sampling=scene.sampling(),
         backend=options.backend,
     )
     width, height = cameras[0].width, cameras[0].height

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import add_root, cameras_of, scene_file
+from nsvq_lightning.commands.arguments import add_root, cameras_of, scene_file, trained_scene
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
@@ -90,7 +90,7 @@ def run(options: argparse.Namespace) -> int:
 @contextmanager
 def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
     """The scene that is meant, as a ``.nsvq`` file; that of a running fit is yet to come."""
-    from nsvq_lightning.io.formats import read_scene, save
+    from nsvq_lightning.io.formats import save
     from nsvq_lightning.io.nsvq.header import read_header
     from nsvq_lightning.io.nsvq.precision import Storage
 
@@ -102,7 +102,7 @@ def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
         return
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "scene.nsvq"
-        save(read_scene(file), made, Storage("paper"))
+        save(trained_scene(file, options.root), made, Storage("paper"))
         yield made
 
 

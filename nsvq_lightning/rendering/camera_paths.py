@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -171,6 +172,8 @@ _MAX_SIDE = 1 << 16
 def read_cameras(path: Path) -> dict[str, Camera]:
     """The cameras of photos by name, as INRIA's trainer lists them; their principal points are in the middle.
 
+    It lists them in the size of the photos, which it trains with as its ``cfg_args`` beside the list says.
+
     Args:
         path: JSON, a list of ``img_name``, ``width``, ``height``, ``fx``, ``fy`` (pixels), ``rotation`` (from the
             camera to the world, three rows) and ``position`` (the camera's, scene units), in our axes.
@@ -188,15 +191,28 @@ def read_cameras(path: Path) -> dict[str, Camera]:
             width, height = int(entry["width"]), int(entry["height"])
             if max(width, height) > _MAX_SIDE:
                 raise ValueError(f"a picture of {width}x{height}")
-            lens = (entry["fx"], entry["fy"], width / 2, height / 2)
+            lens = entry["fx"], entry["fy"], width / 2, height / 2
             name = str(entry["img_name"])
             if name in cameras:  # the names of photos in several folders, without these
                 name = f"{name} ({entry['id']})"
-            cameras[name] = camera_of(_rigid_view(rotation, position), lens, width, height)
+            times = _times_smaller(path.with_name("cfg_args"), width)
+            small = tuple(number / times for number in lens)
+            size = round(width / times), round(height / times)
+            cameras[name] = camera_of(_rigid_view(rotation, position), small, *size)
     if not cameras:
         return {}
     near = Frame.around(poses(list(cameras.values()))[0]).near
     return {name: replace(camera, near=near) for name, camera in cameras.items()}
+
+
+def _times_smaller(arguments: Path, width: int) -> float:
+    """How many times smaller than the photos, ``width`` pixels wide, INRIA's trainer was asked to train them."""
+    text = arguments.read_text(encoding="utf-8", errors="replace") if arguments.is_file() else ""
+    found = re.search(r"\bresolution=(-?\d+)", text)
+    asked = int(found[1]) if found else -1
+    if asked in (1, 2, 4, 8):
+        return asked
+    return width / asked if asked > 0 else max(1.0, width / 1600)
 
 
 # Coordinates below this float32 holds with room to spare.

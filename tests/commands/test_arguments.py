@@ -2,8 +2,10 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from splat_scenes import random_splats
 
@@ -16,9 +18,11 @@ from nsvq_lightning.commands.arguments import (
     positive,
     scene_file,
     some_of,
+    trained_scene,
     unknown_option,
     views_of,
 )
+from nsvq_lightning.io.formats import read_scene, save
 
 
 def test_lists_have_each_entry_once() -> None:
@@ -98,6 +102,26 @@ def test_cameras_of_inrias_trainer_lie_up_to_two_folders_above_the_scene(tmp_pat
         views, photos = views_of(scene, random_splats(9), 5, None)
         assert ([(view.width, view.height) for view in views], photos) == ([(8, 6)], None)
         assert views[0].position.tolist() == [0, 0, -3]
+
+
+def test_a_scene_has_the_cameras_that_lie_beside_it(tmp_path: Path, demo_scene: Path) -> None:
+    path = tmp_path / "scene.ply"
+    save(random_splats(9), path)
+    assert len(trained_scene(path, None).cameras) == 0
+    assert len(trained_scene(path, demo_scene).cameras) > 5
+    (tmp_path / "cameras.json").write_text(json.dumps([ENTRY]))
+    assert trained_scene(path, None).cameras.tolist() == [[0, 0, -3, 7]]
+    kept = tmp_path / "scene.nsvq"
+    save(replace(read_scene(path), cameras=np.array([[1.0, 2, 3, 9]])), kept)
+    assert trained_scene(kept, demo_scene).cameras.tolist() == [[1, 2, 3, 9]]  # its own
+
+
+@pytest.mark.parametrize(("settings", "width"), [("factor: 4", 24), ("max_width: 48", 48), ("seed: 0", 96)])
+def test_photos_of_a_run_have_the_size_that_it_trained(
+    tmp_path: Path, demo_scene: Path, settings: str, width: int
+) -> None:
+    (tmp_path / "config.yaml").write_text(f"data: {{init_args: {{root: {demo_scene}, {settings}}}}}")
+    assert {camera.width for camera in cameras_of(tmp_path, None).values()} == {width}
 
 
 def test_no_cameras_are_found_where_there_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -212,6 +212,22 @@ def test_cameras_of_inrias_trainer(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("arguments", "times"),
+    [(None, 2), ("-1", 2), ("1", 1), ("8", 8), ("800", 4), ("0", 2)],
+)
+def test_cameras_of_inrias_trainer_have_the_size_it_trained(
+    tmp_path: Path, arguments: str | None, times: float
+) -> None:
+    entry = _inria(around([0.0])[0], "a", width=3200, height=1600)
+    (tmp_path / "cameras.json").write_text(json.dumps([entry]))
+    if arguments is not None:
+        (tmp_path / "cfg_args").write_text(f"Namespace(sh_degree=3, images='images', resolution={arguments})")
+    (camera,) = read_cameras(tmp_path / "cameras.json").values()
+    assert (camera.width, camera.height) == (3200 / times, 1600 / times)
+    assert camera.intrinsics == (100 / times, 90 / times, 1600 / times, 800 / times)
+
+
+@pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, "not a rotation and a position"),
