@@ -80,7 +80,7 @@ class Frame:
         """The sampling of splats of the files, here."""
         if sampling is None:
             return None
-        return sampling._replace(nearest=sampling.nearest / self.unit, farthest=sampling.farthest / self.unit)
+        return sampling._replace(distances=sampling.distances / self.unit)
 
     def splats(self, splats: SplatTensors) -> RawSplats:
         """Splats of the files, here; detached."""

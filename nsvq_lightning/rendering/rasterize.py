@@ -103,19 +103,19 @@ def render(
 
 
 def _sampling(means: Tensor, camera: Camera, sampling: Sampling | Tensor | float) -> ViewSampling:
+    n = len(means)
     if not isinstance(sampling, Sampling):
         density = torch.as_tensor(sampling).to(means)
-        if not (density > 0).all():
-            raise ValueError("sampling must be above 0: pixels per unit of the scene that the splats were trained at")
+        if density.dim() > 1 or not (density > 0).all():
+            raise ValueError(
+                "sampling must be pixels per unit of the scene that the splats were trained at, above 0, a number or "
+                f"one a splat, got {list(density.shape)}"
+            )
         distance = focal_of(camera) / density
-        if distance.dim() == 0:
-            distance = distance.expand(len(means))
-        sampling = Sampling(distance, distance, [focal_of(camera)])
-    n = len(means)
-    lengths = [list(distance.shape) for distance in (sampling.nearest, sampling.farthest)]
-    if lengths != [[n], [n]]:
-        raise ValueError(f"sampling must be that of {n} splats, got {' and '.join(map(str, lengths))}")
+        sampling = Sampling(distance.expand(2, *(distance.shape or [n])), [focal_of(camera)])
     distances, size = sampling.in_view(camera)
+    if distances.shape != (2, n):
+        raise ValueError(f"sampling must be that of {n} splats, got {list(distances.shape)}")
     return ViewSampling(distances.detach().to(means).contiguous(), size)
 
 

@@ -50,13 +50,11 @@ class Sampling(NamedTuple):
     """How training saw N splats.
 
     Attributes:
-        nearest: Distance of each splat from the nearest camera ``[N]``, scene units.
-        farthest: From the farthest ``[N]``.
+        distances: Of each splat from the nearest camera, and from the farthest ``[2, N]``, scene units.
         focals: Focal lengths of the cameras, pixels; at least one.
     """
 
-    nearest: "Tensor"
-    farthest: "Tensor"
+    distances: "Tensor"
     focals: Sequence[float]
 
     @classmethod
@@ -76,16 +74,15 @@ class Sampling(NamedTuple):
         gap = 0.0
         if len(places) > 1:
             gap = float(torch.cdist(places, places).fill_diagonal_(math.inf).amin(1).median())
-        return cls(torch.maximum(nearest - gap, nearest / 2), farthest + gap, np.unique(cameras[:, 3]).tolist())
+        distances = torch.stack([torch.maximum(nearest - gap, nearest / 2), farthest + gap])
+        return cls(distances, np.unique(cameras[:, 3]).tolist())
 
     def in_view(self, camera: "Camera") -> ViewSampling:
         """For a camera: its size is relative to that of the photos with the most similar focal length."""
-        import torch
-
         here = focal_of(camera)
         ratio = min((here / focal for focal in self.focals), key=lambda ratio: abs(math.log(ratio)))
         same = abs(math.log(ratio)) < SAME_SIZE
-        return ViewSampling(torch.stack([self.nearest, self.farthest]), 1.0 if same else ratio**2)
+        return ViewSampling(self.distances, 1.0 if same else ratio**2)
 
 
 def focal_of(camera: "Camera") -> float:

@@ -114,7 +114,7 @@ def test_anti_aliasing(log_scale: float) -> None:
 def test_sampling(times: float) -> None:
     splats, camera = random_splats(24, log_scale=-3.5), front_camera(16, 12)
     away = (splats.means - camera.position).norm(dim=1)
-    sampling = Sampling(away * torch.linspace(0.5, 1.5, 24), 1.2 * away, [focal_of(camera) / times])
+    sampling = Sampling(torch.stack([away * torch.linspace(0.5, 1.5, 24), 1.2 * away]), [focal_of(camera) / times])
     ours, _ = assert_same(splats, camera, sampling=sampling)
     plain = render(on_device(splats), camera, backend="cuda").image.detach().cpu()
     assert (plain - ours.image).abs().max() > 0.01

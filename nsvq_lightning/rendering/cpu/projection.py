@@ -27,6 +27,16 @@ def load_means(means, start, count, scratch):
 
 
 @inline
+def load_numbers(numbers, start, count, scratch):
+    """A number of 16 splats, an incomplete vector as in :func:`load_means`."""
+    if count < 16:
+        for k in range(count):
+            simd.put(scratch, k, simd.get(numbers, start + k))
+        return simd.load(scratch, 0)
+    return simd.load(numbers, start)
+
+
+@inline
 def load_shapes(quats, scales, logits, start, count, scratch):
     """16 quaternions, log scales and opacity logits, an incomplete vector as in :func:`load_means`."""
     if count < 16:
@@ -46,7 +56,7 @@ def load_shapes(quats, scales, logits, start, count, scratch):
 def project_range(camera, sampling, means, quats, scales, logits, first, last, records, integers, ids, scratch):
     """Write the records of a range's visible splats; returns how many there are and how many slots they need.
 
-    ``sampling`` are nearest and farthest distances, with 16 numbers more, and the size, or None.
+    ``sampling`` are nearest and farthest distances, and the size, or None.
     """
     zero = simd.broadcast(0)
     visible = 0
@@ -62,7 +72,9 @@ def project_range(camera, sampling, means, quats, scales, logits, first, last, r
         quat, scale, logit = load_shapes(quats, scales, logits, start, count, scratch)
         trained_at = None
         if sampling is not None:
-            trained_at = simd.load(sampling[0], start), simd.load(sampling[1], start), simd.broadcast(sampling[2])
+            nearest = load_numbers(sampling[0], start, count, scratch)
+            farthest = load_numbers(sampling[1], start, count, scratch)
+            trained_at = nearest, farthest, simd.broadcast(sampling[2])
         seen, record, corner, end, radius = footprint(view, load_screen(camera), point, quat, scale, logit, trained_at)
         bits = simd.mask_bits(seen) & lanes
         if bits == 0:

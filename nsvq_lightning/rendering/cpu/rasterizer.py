@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import pad
 
 from nsvq_lightning.compute.jit import thread_count
 from nsvq_lightning.compute.memory import Array, Workspace, flat, flat_checked, recycled
@@ -29,8 +28,7 @@ class _Frame:
         self.camera = rec.pack_camera(camera)
         self.sampling = None
         if sampling is not None:
-            # Kernels read whole vectors.
-            nearest, farthest = pad(sampling.distances, (0, 16))
+            nearest, farthest = sampling.distances
             self.sampling = flat(nearest), flat(farthest), np.float32(sampling.size)
         self.size = width, height = camera.width, camera.height
         self.group_columns, group_rows = rec.group_grid(width, height)
