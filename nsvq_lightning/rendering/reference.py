@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.sampling import ViewSampling
@@ -25,6 +24,7 @@ class Projection(NamedTuple):
     Attributes:
         means2d: Projected centres ``[N, 2]``, pixels.
         conics: Inverse covariances with the blur ``[N, 3]``: xx, xy, yy, 1 / square pixels.
+        opacities: Opacities ``[N]`` in [0, 1].
         depths: View-space z ``[N]``.
         half_sizes: Half width and height ``[N, 2]`` in pixels of the box outside which α stays below 1/255; 0 for a
             splat that never reaches it.
@@ -32,6 +32,7 @@ class Projection(NamedTuple):
 
     means2d: Tensor
     conics: Tensor
+    opacities: Tensor
     depths: Tensor
     half_sizes: Tensor
 
@@ -75,11 +76,13 @@ def image_axes(
     return (x, y, z), (across[:, :, None] * axes).sum(1), (along[:, :, None] * axes).sum(1)
 
 
-def sampling_ratio(means: Tensor, camera: Camera, sampling: ViewSampling) -> Tensor:
+def sampling_ratio(means: Tensor, camera: Camera, sampling: ViewSampling | None) -> Tensor:
     """r² ``[N]``: pixels per unit of world at splats of centres ``[N, 3]``, relative to training, squared.
 
-    Within the distances of training, that is (focal length here / there)².
+    Within the distances of training, that is (focal length here / there)²; 1 where training is not known.
     """
+    if sampling is None:
+        return torch.ones_like(means[:, 0])
     viewmat = camera.viewmat.to(means)
     squared = (times_vectors(viewmat[:3, :3], means) + viewmat[:3, 3]).square().sum(1)
     nearest, farthest = sampling.distances.to(means).square()
@@ -87,32 +90,32 @@ def sampling_ratio(means: Tensor, camera: Camera, sampling: ViewSampling) -> Ten
     return sampling.size * (trained / squared).clamp_max(constants.MAX_RATIO)
 
 
-def blur_of(splats: SplatTensors, camera: Camera, sampling: ViewSampling | None) -> Tensor:
-    """Blur ``[N]`` in square pixels: the rasterizer's own, or what a splat was trained with where that is larger."""
-    if sampling is None:
-        return splats.means.new_full(splats.means.shape[:1], constants.BLUR)
-    return constants.BLUR * sampling_ratio(splats.means, camera, sampling).clamp_min(1)
-
-
 def project(splats: SplatTensors, camera: Camera, sampling: ViewSampling | None = None) -> Projection:
     """Project splats through the local affine approximation of the camera (EWA splatting).
 
     The determinant uses Lagrange's identity, |u|²|v|² - (u·v)² = |u × v|²: the naive difference loses every digit for
     splats of thousands of pixels. The determinant of a huge splat is taken in units of its size, or it would overflow.
+
+    The blur that splats were trained with is blur·r² here. Where that is less than a pixel's own, opacities are
+    multiplied by √(det(Σ + blur·r²·I) / det(Σ + blur·I)): with r = 0, which is anti-aliasing, the factor of
+    Mip-Splatting's 2D filter (Yu et al. 2024). The blur does not matter to huge splats.
     """
     fx, fy, cx, cy = camera.intrinsics
     (x, y, z), u, v = image_axes(splats.means, splats.quats, splats.scales, camera)
     xx, xy, yy = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
     size = (xx + yy).detach()
     unit = torch.where(size > constants.HUGE_FOOTPRINT, 1 / size, torch.ones_like(size))
-    determinant = (torch.linalg.cross(u, v) * unit[:, None]).square().sum(-1)
-    blur = blur_of(splats, camera, sampling)
-    xx, yy = xx + blur, yy + blur
-    determinant = determinant + blur * (xx + yy - blur) * unit * unit
-    conics = torch.stack([yy, -xy, xx], -1) * (unit / determinant * unit)[:, None]
-    reach = 2 * (torch.sigmoid(splats.opacities.detach()) / constants.ALPHA_MIN).log().clamp_min(0)
-    half = (reach[:, None] * torch.stack([xx, yy], -1).detach()).sqrt()
-    return Projection(torch.stack([fx * x / z + cx, fy * y / z + cy], -1), conics, z, half)
+    area = (torch.linalg.cross(u, v) * unit[:, None]).square().sum(-1)
+    trained = constants.BLUR * sampling_ratio(splats.means, camera, sampling)
+    blur = trained.clamp_min(constants.BLUR)
+    kept, determinant = (area + b * (xx + yy + b) * unit * unit for b in (trained, blur))
+    conics = torch.stack([yy + blur, -xy, xx + blur], -1) * (unit / determinant * unit)[:, None]
+    light = (kept / determinant).clamp_min(constants.FAINTEST * constants.FAINTEST).sqrt()
+    dimmed = (trained < constants.BLUR) & (size < constants.HUGE_FOOTPRINT)
+    opacities = torch.sigmoid(splats.opacities) * torch.where(dimmed, light, 1.0)
+    reach = 2 * (opacities.detach() / constants.ALPHA_MIN).log().clamp_min(0)
+    half = (reach[:, None] * torch.stack([xx + blur, yy + blur], -1).detach()).sqrt()
+    return Projection(torch.stack([fx * x / z + cx, fy * y / z + cy], -1), conics, opacities, z, half)
 
 
 @torch.no_grad()
@@ -121,45 +124,12 @@ def visible(splats: SplatTensors, camera: Camera, sampling: ViewSampling | None 
 
     Those with a non-finite geometry are left out.
     """
-    means2d, conics, depths, half_sizes = project(splats, camera, sampling)
+    means2d, conics, _, depths, half_sizes = project(splats, camera, sampling)
     low = (means2d - half_sizes - 0.5).ceil().clamp_min(0)
     size = means2d.new_tensor([camera.width - 1, camera.height - 1])
     high = torch.minimum((means2d + half_sizes - 0.5).floor(), size)
     reached = (half_sizes > 0).all(-1) & (low <= high).all(-1)
     return ((depths > camera.near) & reached & torch.isfinite(conics).all(-1)).nonzero()[:, 0]
-
-
-def light_kept(splats: SplatTensors, camera: Camera, rows: Tensor, sampling: ViewSampling) -> Tensor:
-    """What the opacities of the splats ``rows [V]``, int64, ascending, are multiplied by: ``[V]``.
-
-    √(det(Σ + blur·r²·I) / det(Σ + blur·I)) with Σ the projected covariance and r² as in :func:`sampling_ratio` where
-    that is below 1, differentiable in means, quaternions and log-scales.
-    """
-    means, quats, scales = (take_rows(getattr(splats, name), rows) for name in ("means", "quats", "scales"))
-    _, u, v = image_axes(means, quats, scales, camera)
-    # The blur does not matter to splats so large that squares of their area would overflow.
-    counts = (u.square().sum(1) + v.square().sum(1)).detach() < constants.HUGE_FOOTPRINT
-    u, v = torch.where(counts[:, None], u, 0.0), torch.where(counts[:, None], v, 0.0)
-    area = torch.linalg.cross(u, v).square().sum(1)  # det Σ by Lagrange's identity, which loses no digits
-    size = u.square().sum(1) + v.square().sum(1)
-    own, kept = constants.BLUR, constants.BLUR * sampling_ratio(means, camera, sampling.of(rows)).clamp_max(1)
-    ratio = (area + kept * (size + kept)) / (area + own * (size + own))
-    factor = ratio.clamp_min(constants.FAINTEST * constants.FAINTEST).sqrt()
-    return torch.where(counts, factor, 1.0)
-
-
-def compensated(splats: SplatTensors, camera: Camera, sampling: ViewSampling) -> RawSplats:
-    """The splats with the opacities that keep their light when the rasterizer blurs them more than training did.
-
-    Each opacity in view is multiplied by :func:`light_kept`, with anti-aliasing the factor of Mip-Splatting's
-    2D filter (Yu et al. 2024): a splat that the blur makes twice as large becomes half as opaque. The factor is
-    differentiable in means, quaternions and scales, and depends on the camera.
-    """
-    rows = visible(splats, camera, sampling)
-    opacity = take_rows(splats.opacities, rows).sigmoid() * light_kept(splats, camera, rows, sampling)
-    opacity = opacity.clamp_max(1 - 2.0**-20)  # the rasterizer caps it lower, and its logit is finite
-    seen = splats.opacities.index_copy(0, rows, opacity.log() - (-opacity).log1p())
-    return RawSplats(**{name: getattr(splats, name) for name in ATTRIBUTES} | {"opacities": seen})
 
 
 def render(
@@ -175,8 +145,6 @@ def render(
 
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.
     """
-    if sampling is not None:
-        splats = compensated(splats, camera, sampling)
     rows = visible(splats, camera, sampling)
     shown = RawSplats(*(getattr(splats, name)[rows] for name in ATTRIBUTES))
     projection = project(shown, camera, None if sampling is None else sampling.of(rows))
@@ -189,7 +157,6 @@ def render(
     direction = direction / direction.square().sum(-1, keepdim=True).clamp_min(1e-20).sqrt()
     colors = sh_colors(direction, shown.sh0, shown.shN, sh_degree)
     features = torch.cat([colors, projection.depths[:, None]], -1)
-    opacities = torch.sigmoid(shown.opacities)
     centres = means2d[rows]
 
     order = torch.sort(projection.depths.detach(), stable=True).indices
@@ -212,8 +179,8 @@ def render(
             pixels = torch.stack([xs, ys], -1).reshape(-1, 2) + 0.5
             weights_here = pixel_weights[top:bottom, left:right].reshape(-1)
             inputs = (
-                pixels, centres[near], projection.conics[near], opacities[near], features[near], weights_here,
-                watched[near],
+                pixels, centres[near], projection.conics[near], projection.opacities[near], features[near],
+                weights_here, watched[near],
             )  # fmt: skip
             blended = checkpoint(_blend, *inputs, use_reentrant=False) if torch.is_grad_enabled() else _blend(*inputs)
             tiles.append(blended.view(bottom - top, right - left, 5))

@@ -16,7 +16,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import rasterizer
 from nsvq_lightning.rendering.cpu.records import MAX_SIDE
 from nsvq_lightning.rendering.rasterize import render, visible
-from nsvq_lightning.rendering.reference import light_kept
+from nsvq_lightning.rendering.reference import project
 from nsvq_lightning.rendering.sampling import ViewSampling
 from nsvq_lightning.skips import switched
 from nsvq_lightning.splats.splats import RawSplats, Splats
@@ -350,8 +350,8 @@ def test_the_factor_is_that_of_the_determinants() -> None:
     )
     along = camera.intrinsics[1] / camera.intrinsics[0]
     expected = math.prod((size / (size + 0.3)) ** 0.5 for size in (pixels**2, (pixels * along) ** 2))
-    none_kept = ViewSampling(torch.zeros(2, 1), 0.0)
-    assert float(light_kept(splats, camera, torch.tensor([0]), none_kept)) == pytest.approx(expected, rel=1e-3)
+    found = project(splats, camera, ViewSampling(torch.zeros(2, 1), 0.0)).opacities / splats.opacities.sigmoid()
+    assert float(found) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
