@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +143,7 @@ class LiveScene(WritingCallback):
             if module.history:
                 state["psnr"] = f"{module.history[-1]['psnr']:.2f}"
             scene = CompressedScene.from_splats(splats, config={"antialiased": module.antialiased, "live": state})
-            scene = placed(scene, module.frame)
+            scene = replace(placed(scene, module.frame), cameras=module.cameras)
             with optional(folder / viewer.LIVE_SCENE):
                 save(scene, folder / viewer.LIVE_SCENE, Storage("paper"))
         self._answered, ended = asked, time.monotonic()
