@@ -36,6 +36,8 @@ def _text(facts: dict[str, Any]) -> str:
     ]
     if any(facts.get("origin", ())):
         rows.append(("origin", ", ".join(map(repr, facts["origin"]))))
+    if facts.get("cameras"):
+        rows.append(("cameras", f"{facts['cameras']} of training"))
     parts = ["\n".join(f"{name:<11} {value}" for name, value in rows)]
     if "attributes" in facts:
         entries = map(itemgetter("name", "storage", "dim", "codes", "bits"), facts["attributes"])

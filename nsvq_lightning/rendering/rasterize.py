@@ -13,6 +13,10 @@ from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, check_shapes, sh_degree_of
 
 
+# Largest relative difference of samplings that only rounding makes.
+ROUNDING = 1e-5
+
+
 class Render(NamedTuple):
     """What :func:`render` returns.
 
@@ -111,8 +115,9 @@ def _sampling(means: Tensor, camera: Camera, sampling: Sampling | Tensor | float
                 "sampling must be pixels per unit of the scene that the splats were trained at, above 0, a number or "
                 f"one a splat, got {list(density.shape)}"
             )
-        distance = focal_of(camera) / density
-        sampling = Sampling(distance.expand(2, *(distance.shape or [n])), [focal_of(camera)])
+        distance = (focal_of(camera) / density).expand(density.shape or [n])
+        # What is meant to be that of training is it, whatever was rounded.
+        sampling = Sampling(torch.stack([(1 - ROUNDING) * distance, (1 + ROUNDING) * distance]), [focal_of(camera)])
     distances, size = sampling.in_view(camera)
     if distances.shape != (2, n):
         raise ValueError(f"sampling must be that of {n} splats, got {list(distances.shape)}")

@@ -73,6 +73,7 @@ def test_sampling_as_pixels_per_unit() -> None:
     half = render(splats, camera, sampling=2 * here).image
     sampling = Sampling(distances(splats, camera).expand(2, -1), [2 * focal_of(camera)])
     torch.testing.assert_close(half, render(splats, camera, sampling=sampling).image)
+    assert torch.equal(render(splats, camera, sampling=here).image, render(splats, camera).image)
     one = render(splats, camera, sampling=30.0).image
     assert torch.equal(one, render(splats, camera, sampling=torch.full((50,), 30.0)).image)
 

@@ -313,6 +313,7 @@ def describe_nsvq(path: StrPath) -> Json:
         "splats": header.splats,
         "sh_degree": header.sh_degree,
         "origin": list(header.origin),
+        "cameras": len(header.cameras),
         "attributes": [{**entry._asdict(), "bits": entry.bits} for entry in header.attributes],
         "streams": [
             {"name": stream.name, "encoding": stream.encoding, "bytes": stream.length}
