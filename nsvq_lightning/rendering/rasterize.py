@@ -12,7 +12,6 @@ from nsvq_lightning.rendering.sampling import Sampling, ViewSampling, focal_of
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, check_shapes, sh_degree_of
 
-
 # Largest relative difference of samplings that only rounding makes.
 ROUNDING = 1e-5
 
