@@ -58,6 +58,34 @@ def image_head(path: Path) -> ImageHead:
     return ImageHead((width, height), orientation, has_alpha)
 
 
+# Relative difference of aspect ratios that rounding explains.
+ROUNDED = 0.01
+
+
+def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes (width, height) have one aspect ratio, up to rounding of a side to a pixel of the first."""
+    difference = abs(one[0] * other[1] - one[1] * other[0])
+    return difference < max(ROUNDED * one[1] * other[0], *other)
+
+
+def head_for(path: Path, expected: tuple[int, int]) -> ImageHead:
+    """The head of a photo for a camera of some size: with the orientation to apply, and the size that it then has.
+
+    Args:
+        path: Image file; of one that cannot be read, the head is as expected.
+        expected: Width and height of the camera, pixels.
+    """
+    try:
+        size, orientation, has_alpha = image_head(path)
+    except SceneError:
+        return ImageHead(expected, 1, False)  # it is left out once its pixels are missed
+    # COLMAP calibrates photos as they are stored, other programs as their EXIF orientation shows them.
+    turned = size[::-1]
+    if orientation >= ON_ITS_SIDE and same_shape(turned, expected) and not same_shape(size, expected):
+        return ImageHead(turned, orientation, has_alpha)
+    return ImageHead(size, 1, has_alpha)
+
+
 def _undecodable(path: Path, reason: str) -> SceneError:
     return SceneError(f"image {path} cannot be decoded ({reason}): copy it again, or remove it and run COLMAP again")
 
@@ -138,16 +166,6 @@ def _turned_back(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
     return np.ascontiguousarray(pixels)
 
 
-# Relative difference of aspect ratios that rounding explains.
-ROUNDED = 0.01
-
-
-def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two sizes (width, height) have one aspect ratio, up to rounding of a side to a pixel of the first."""
-    difference = abs(one[0] * other[1] - one[1] * other[0])
-    return difference < max(ROUNDED * one[1] * other[0], *other)
-
-
 def read_mask(path: Path, size: tuple[int, int]) -> Bools:
     """Which pixels of a photo count ``[H, W]``: those that are more than half as bright as the brightest.
 
@@ -176,8 +194,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bools:
             f"mask {path} is of {bright.shape[1]}x{bright.shape[0]}, its photo of {size[0]}x{size[1]}, another shape: "
             "make it from that photo, or remove it"
         )
-    kept = cv2.resize(bright.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    return np.asarray(kept, bool)
+    return np.asarray(cv2.resize(bright.view(np.uint8), size, interpolation=cv2.INTER_NEAREST), bool)
 
 
 def resized(image: Uint8s, kept: Bools | None, size: tuple[int, int]) -> tuple[Uint8s, Bools | None]:

@@ -18,16 +18,7 @@ from tqdm import tqdm
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, larger_models
-from nsvq_lightning.data.images import (
-    ON_ITS_SIDE,
-    ImageHead,
-    ImageSource,
-    ImageStore,
-    Picture,
-    high_pass,
-    image_head,
-    same_shape,
-)
+from nsvq_lightning.data.images import ImageSource, ImageStore, Picture, head_for, high_pass, same_shape
 from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder
 from nsvq_lightning.data.points import random_points
 from nsvq_lightning.data.transforms import read_poses
@@ -197,8 +188,7 @@ def load_scene(
         raise ValueError(f"test_every must be at least 2 (1 leaves no train view), got {test_every}")
     root = Path(root).expanduser()
     poses = read_poses(root, model, allow_outside=allow_outside)
-    larger = larger_models(root) if model is None and poses.source == "COLMAP" else None
-    if larger is not None:
+    if model is None and poses.source == "COLMAP" and (larger := larger_models(root)) is not None:
         log.warning("%s: %s", root, larger)
     views = range(len(poses.images))
     test = tuple(views[::test_every])
@@ -276,7 +266,7 @@ def _image_sources(
     others = 0
     for image, path in zip(model.images, paths, strict=True):
         camera = model.cameras[image.camera_id]
-        head = _head_for(path, (camera.width, camera.height))
+        head = head_for(path, (camera.width, camera.height))
         heads.append(head)
         kinds.append((image.camera_id, head.size))
         others += not same_shape(head.size, (camera.width, camera.height))
@@ -295,19 +285,6 @@ def _image_sources(
         ImageSource(path, head.size, *lenses[kind], head.orientation, mask, head.has_alpha, model.synthetic)
         for path, head, kind, mask in zip(paths, heads, kinds, masks, strict=True)
     ]
-
-
-def _head_for(path: Path, expected: tuple[int, int]) -> ImageHead:
-    """The head of a photo for a camera of some size: with the orientation to apply, and the size that it then has."""
-    try:
-        size, orientation, has_alpha = image_head(path)
-    except SceneError:
-        return ImageHead(expected, 1, False)  # it is left out once its pixels are missed
-    # COLMAP calibrates photos as they are stored, other programs as their EXIF orientation shows them.
-    turned = size[::-1]
-    if orientation >= ON_ITS_SIDE and same_shape(turned, expected) and not same_shape(size, expected):
-        return ImageHead(turned, orientation, has_alpha)
-    return ImageHead(size, 1, has_alpha)
 
 
 S = TypeVar("S")
