@@ -11,14 +11,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.callbacks import LearningRateDecay, PhaseSchedule, SplatBudget, standard
-from nsvq_lightning.compression.importance import (
-    below_cap,
-    contributions,
-    likely_effects,
-    most_contributing,
-    row_weights,
-    sensitivity,
-)
+from nsvq_lightning.compression import importance
 from nsvq_lightning.compression.stored import components
 from nsvq_lightning.compression.viewpoints import Measure
 from nsvq_lightning.compute.devices import best_device
@@ -90,8 +83,7 @@ def setting_for(size: int, most: int, sh_degree: int) -> Setting:
         raise ValueError(f"{size} bytes leave room for {max(room, 0)} of {most} splats beside codebooks: allow more")
     codes, dim = sizes.get("shN", (0, 1))
     spare = max(0.0, 8 * size - fixed - most * (PLACE + bits))
-    bits_a_code = dim * ATTRIBUTES["shN"].code_bits
-    more = min(spare / bits_a_code, codes, most / 8)
+    more = min(spare / (dim * ATTRIBUTES["shN"].code_bits), codes, most / 8)
     return Setting(min(most, room), name, more=int(more))
 
 
@@ -178,23 +170,24 @@ class Compressor:
             rows, basis = components(torch.from_numpy(scene.raw["shN"]), self._weights(whole), setting.step)
             scene = replace(scene, raw={**scene.raw, "shN": rows}, bases={"shN": basis})
         if setting.kept < 1:
-            kept = most_contributing(self._effects(whole), math.ceil(setting.kept * len(scene)))
+            kept = importance.most_contributing(self._effects(whole), math.ceil(setting.kept * len(scene)))
             scene = scene.take(kept.numpy()).in_use()
         return Candidate(setting, b"".join(frame(*encode(scene, self.storage))))
 
     def _row_weights(self, setting: Setting) -> Tensor:
         """How much each splat counts where harmonics are put on a basis ``[N]``."""
         splats = self._trained(setting).decode()
-        return row_weights(contributions(splats, self._views.values(), self._render)).sqrt()
+        contribution = importance.contributions(splats, self._views.values(), self._render)
+        return importance.row_weights(contribution).sqrt()
 
     def _likely_effects(self, setting: Setting) -> Tensor:
         """How much pictures are likely to change without each splat ``[N]``."""
-        splats = below_cap(self._trained(setting).decode())
+        splats = importance.below_cap(self._trained(setting).decode())
         squares = torch.zeros_like(splats.opacities)
         for index, camera in self._views.items():
             signs = generator(self.seed, 0, "signs", index)
-            squares += sensitivity(splats, camera, self._render, signs)[0].opacities
-        return likely_effects(splats, squares)
+            squares += importance.sensitivity(splats, camera, self._render, signs)[0].opacities
+        return importance.likely_effects(splats, squares)
 
     def error(self, candidate: Candidate) -> float:
         """Root mean square difference between its pictures and those of the original, for channels in [0, 1]."""

@@ -15,18 +15,9 @@ from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
 from nsvq_lightning.io.numbers import FLAT, finite_logits, finite_logs, logits_of, opacity_of
+from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
-from nsvq_lightning.splats.conventions import (
-    SH_C0,
-    Arrays,
-    Float32s,
-    Float64s,
-    Uint32s,
-    from_smallest_three,
-    shN_degree,
-    smallest_three,
-    unit,
-)
+from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s, Uint32s
 
 _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _TYPES = {
@@ -236,7 +227,7 @@ def splat_degree(header: PlyHeader) -> int:
     if strange or len(rest) not in (0, 9, 24, 45):
         got = f"{len(rest)}, among them {strange[0]}" if strange else f"{len(rest)}"
         raise FormatError(f"SH degrees 0 to 3 have 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ...; got {got}")
-    return shN_degree(len(rest) // 3)
+    return conventions.shN_degree(len(rest) // 3)
 
 
 def _needed(header: PlyHeader, sh_degree: int) -> dict[str, list[str]]:
@@ -310,8 +301,7 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
     ends = np.cumsum([len(names) for names in columns.values()])
     start = 0
     for table in read_ply_columns(path, header, [*chain(*columns.values())]):
-        parts = np.split(table, ends[:-1], axis=1)
-        for name, part in zip(columns, parts, strict=True):
+        for name, part in zip(columns, np.split(table, ends[:-1], axis=1), strict=True):
             rows[name][start : start + len(table), : part.shape[1]] = part
         start += len(table)
     if columns["sh0"] == _RGB:
@@ -371,7 +361,7 @@ def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, 
         "scales": shares["packed_scale"],
         "sh0": shares["packed_color"][:, :3],
         "opacities": logits_of(shares["packed_color"][:, 3]),
-        "quats": from_smallest_three(largest, (shares["packed_rotation"] - 0.5) * math.sqrt(2)),
+        "quats": conventions.from_smallest_three(largest, (shares["packed_rotation"] - 0.5) * math.sqrt(2)),
     }
     bounds = np.stack([chunks[name] for name in _bounds(chunk)], axis=1)
     ends = np.split(_for_each(bounds, header.count), bounds.shape[1] // 3, axis=1)
@@ -441,7 +431,7 @@ def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
     bounds = np.stack([each.reduceat(values, starts) for each in (np.minimum, np.maximum)], axis=2)
     low, high = np.moveaxis(_for_each(bounds, len(scene)), 2, 0)
     shares = (values - low) / np.where(high > low, high - low, 1)
-    largest, others = smallest_three(unit(scene.rows("quats")))
+    largest, others = conventions.smallest_three(conventions.unit(scene.rows("quats")))
     parts = {
         "packed_position": shares[:, 0],
         "packed_rotation": others / math.sqrt(2) + 0.5,
@@ -482,8 +472,7 @@ def write_elements(path: StrPath, elements: Mapping[str, NDArray[np.void]], anti
 def _packed(shares: Float64s, lowest: Sequence[int], largest: Sequence[int]) -> Uint32s:
     """Invert :func:`_unpacked`, to the nearest numbers."""
     numbers = np.rint(shares.clip(0, 1) * largest).astype(np.uint32)
-    words: Uint32s = np.bitwise_or.reduce(numbers << np.array(lowest, np.uint32), axis=1)
-    return words
+    return np.asarray(np.bitwise_or.reduce(numbers << np.array(lowest, np.uint32), axis=1))
 
 
 def plain_ply_bytes(splats: int, sh_degree: int) -> int:

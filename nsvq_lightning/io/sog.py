@@ -37,18 +37,8 @@ from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, Json, check_room, json_object, naming_file, wrong_start
 from nsvq_lightning.io.numbers import bytes_of, logits_of_bytes, opacity_of
-from nsvq_lightning.splats.conventions import (
-    Arrays,
-    Float32s,
-    Float64s,
-    Int64s,
-    Integers,
-    Uint8s,
-    from_smallest_three,
-    sh_coefficients,
-    smallest_three,
-    unit,
-)
+from nsvq_lightning.splats import conventions
+from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, Int64s, Integers, Uint8s, sh_coefficients
 
 log = logging.getLogger(__name__)
 
@@ -288,7 +278,7 @@ class _Archive:
         if not marked.all():
             log.warning("%d of %d rotations have no mark of 252 to 255", np.sum(~marked), self.count)
         others = (texels[:, :3] / 127.5 - 1) / math.sqrt(2)
-        quats = from_smallest_three((texels[:, 3] % 4).astype(np.intp), others)  # 252 is a multiple of 4
+        quats = conventions.from_smallest_three((texels[:, 3] % 4).astype(np.intp), others)  # 252 is a multiple of 4
         quats[~marked] = np.nan
         return quats
 
@@ -345,11 +335,9 @@ def _low_and_high(numbers: Arrays) -> Uint8s:
 
 
 def _packed_quats(rows: Float32s) -> Uint8s:
-    largest, others = smallest_three(unit(rows))
-    texels = np.empty((len(rows), 4), np.uint8)
-    texels[:, :3] = np.rint(127.5 * (1 + math.sqrt(2) * others).clip(0, 2))
-    texels[:, 3] = 252 + largest
-    return texels
+    largest, others = conventions.smallest_three(conventions.unit(rows))
+    packed = np.rint(127.5 * (1 + math.sqrt(2) * others).clip(0, 2))
+    return np.column_stack([packed, 252 + largest]).astype(np.uint8)
 
 
 def _leveled(values: Float32s, weight: Integers | int = 1) -> tuple[Uint8s, list[float]]:
