@@ -116,8 +116,7 @@ def _tree(levels: Sequence[CompressedScene]) -> tuple[Json, list[tuple[list[Inte
         found: Json = {"bound": {"min": _decimals(low), "max": _decimals(high)}}
         finest, *coarser = np.split(splats, np.searchsorted(splats, starts[1:-1]))
         axis = int(means[finest].std(0).argmax())
-        middle = np.median(means[finest, axis])
-        below = means[splats, axis] < middle
+        below = means[splats, axis] < np.median(means[finest, axis])
         if len(finest) > LEAF and below[: len(finest)].any():
             found["children"] = [node(splats[below]), node(splats[~below])]
             return found
@@ -144,8 +143,7 @@ def _boxes(scene: CompressedScene) -> Float64s:
     from scipy.spatial.transform import Rotation
 
     axes = Rotation.from_quat(unit(scene.rows("quats"))[:, [1, 2, 3, 0]]).as_matrix()
-    lengths = np.exp(scene.rows("scales").astype(np.float64))
-    half_axes = axes * lengths[:, None, :]
+    half_axes = axes * np.exp(scene.rows("scales").astype(np.float64))[:, None, :]
     reach = _REACH * np.sqrt(np.square(half_axes).sum(2))
     return np.stack([scene.means - reach, scene.means + reach], axis=1)
 

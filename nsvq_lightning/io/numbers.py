@@ -89,8 +89,7 @@ class Clamped:
 
     def count(self, name: str, beyond: Bools) -> None:
         """Count the splats with any values ``[N, ...]`` of an attribute that are beyond its range."""
-        rows = beyond.any(tuple(range(1, beyond.ndim)))
-        self._counts[name] += int(rows.sum())
+        self._counts[name] += int(beyond.any(tuple(range(1, beyond.ndim))).sum())
 
     def warn(self, path: StrPath, count: int) -> None:
         """Warn how many of ``count`` splats were clamped to the format's range."""
@@ -121,6 +120,5 @@ def coarsest_power(values: Float32s) -> float:
     """The largest power of two of which all ``values`` are integer multiples, 0 if all are 0; they must be finite."""
     mantissas, exponents = np.frexp(values[values != 0])
     wholes = np.ldexp(mantissas, 24).astype(np.int64)  # float32 has so many bits
-    lowest = (wholes & -wholes).astype(np.float64)  # the lowest bit that is set
-    powers = np.ldexp(lowest, exponents - 24)
+    powers = np.ldexp((wholes & -wholes).astype(np.float64), exponents - 24)  # of the lowest bit that is set
     return float(powers.min()) if powers.size else 0.0

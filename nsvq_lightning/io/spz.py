@@ -173,8 +173,7 @@ def zstd_compress(data: memoryview) -> bytes:
     """A Zstandard frame with its length and a checksum; the same data give the same bytes with the same release."""
     zstd = _zstd()
     options = {zstd.CompressionParameter.compression_level: 19, zstd.CompressionParameter.checksum_flag: 1}
-    frame: bytes = zstd.compress(data, options=options)
-    return frame
+    return bytes(zstd.compress(data, options=options))
 
 
 def zstd_decompress(data: memoryview, size: int) -> bytes:
@@ -415,8 +414,7 @@ def _unpacked_means(header: SpzHeader, data: Uint8s) -> NDArray[np.floating[Any]
     # Put three bytes at the top of four, then shift down with the sign.
     wide = np.zeros((header.count, 3, 4), np.uint8)
     wide[:, :, 1:] = data.reshape(header.count, 3, 3)
-    fixed = wide.view("<i4")[:, :, 0] >> 8
-    return fixed / (1 << header.fraction_bits)
+    return (wide.view("<i4")[:, :, 0] >> 8) / (1 << header.fraction_bits)
 
 
 def _unpacked_quats(header: SpzHeader, data: Uint8s) -> Float32s:

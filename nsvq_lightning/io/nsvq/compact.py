@@ -189,17 +189,13 @@ def _decoded(entry: AttributeEntry, streams: Mapping[str, memoryview], near: Int
     return rounding.Stored(entry, values, codebook)
 
 
-# Three float32.
-_FAR_BYTES = 12
-
-
 def _check_tables(header: Header) -> None:
     """Compare with the tables this release would write, before anything is allocated from their sizes."""
     header.check_attributes(_ORDER, _possible)
     if [(stream.name, stream.encoding) for stream in header.streams] != _stream_names(header.attributes):
         raise FormatError("damaged: the stream table does not fit the attribute table")
     lengths = {stream.name: stream.length for stream in header.streams}
-    far, rest = divmod(lengths["means.far"], _FAR_BYTES)
+    far, rest = divmod(lengths["means.far"], 12)  # three float32
     if lengths["means.grid"] != _GRID.size or rest or far > header.splats:
         raise FormatError("damaged: the streams of the positions do not have their sizes")
     errors.check_room("splats", header.splats, sum(lengths.values()))

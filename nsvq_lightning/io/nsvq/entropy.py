@@ -59,8 +59,7 @@ def encode_paths(paths: Int64s, bits: int, neighbours: Int32s) -> bytes:
     check_array("paths", paths, (len(neighbours),), INT64)
     contexts = _path_contexts(bits, neighbours)
     words = _room(len(paths) * bits)
-    used = _write_paths(paths, bits, neighbours, words, contexts)
-    return _bytes(words, used)
+    return _bytes(words, _write_paths(paths, bits, neighbours, words, contexts))
 
 
 def _path_contexts(bits: int, neighbours: Int32s) -> Uint32s:
@@ -83,8 +82,7 @@ def decode_paths(data: bytes | memoryview, bits: int, neighbours: Int32s) -> Int
     """
     contexts = _path_contexts(bits, neighbours)
     paths, words = np.empty(len(neighbours), np.int64), _words(data)
-    used = _read_paths(words, bits, neighbours, paths, contexts)
-    _check_used(words, used)
+    _check_used(words, _read_paths(words, bits, neighbours, paths, contexts))
     return paths
 
 

@@ -81,8 +81,7 @@ def read_nsvq(path: StrPath) -> CompressedScene:
     """
     header, streams = read_frame(path)
     with naming_file(path):
-        scene = decode(header, streams)
-    return replace(scene, stored_bytes=os.path.getsize(path))
+        return replace(decode(header, streams), stored_bytes=os.path.getsize(path))
 
 
 def decode(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene:

@@ -52,8 +52,7 @@ class Precision:
 
     def of(self, name: str) -> float:
         """Largest error of an attribute without a codebook; one that has no option has the error that it declares."""
-        error: float = getattr(self, name, ATTRIBUTES[name].error)
-        return error
+        return float(getattr(self, name, ATTRIBUTES[name].error))
 
     @property
     def opacity_levels(self) -> int:

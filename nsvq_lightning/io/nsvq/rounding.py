@@ -39,8 +39,7 @@ class Stored(NamedTuple):
 
     def row_sums(self) -> Int64s:
         """Sum ``[N]`` of each splat's integers."""
-        sums: Int64s
-        sums = self.values.sum(1) if self.codebook is None else self.codebook.sum(1)[self.values]
+        sums: Int64s = self.values.sum(1) if self.codebook is None else self.codebook.sum(1)[self.values]
         return sums
 
     def floats(self) -> Float32s:
@@ -97,8 +96,7 @@ def _integers(name: str, rows: Float32s, step: float, limit: float = 2.0**52) ->
     """The rows ``[N, D]`` as multiples of a step; quaternions are normalised first, unless they are multiples of it."""
     values = np.rint(rows.astype(np.float64) / step)
     if name == "quats" and not np.array_equal((values * step).astype(np.float32), rows):
-        units = unit(rows).astype(np.float32)
-        values = np.rint(units.astype(np.float64) / step)
+        values = np.rint(unit(rows).astype(np.float32).astype(np.float64) / step)
     if not (np.abs(values) < limit).all():
         raise ValueError(f"{name}: {np.abs(rows).max():.3g} is too large for steps of {step:.3g}; use level 'paper'")
     return values.astype(np.int64)
@@ -144,8 +142,7 @@ def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> Float64s:
     doublings: Float64s = scales.row_sums().astype(np.float64) * factor + for_size_one
     # The logarithm, linear between powers of two.
     mantissas, exponents = np.frexp((np.arange(levels.entry.codes) + 0.5) / levels.entry.codes)
-    logarithms = 2 * mantissas - 2 + exponents
-    doublings -= (0.5 * logarithms)[levels.values]
+    doublings -= (0.5 * (2 * mantissas - 2 + exponents))[levels.values]
     return doublings
 
 
