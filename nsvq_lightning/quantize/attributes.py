@@ -1,7 +1,7 @@
 """Which attributes are quantized, with which codebooks, and a scene whose rows are replaced by their codes."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -44,8 +44,7 @@ def build_quantizers(
 
 def attribute_rows(splats: RawSplats, attribute: str) -> Tensor:
     """Rows ``[N, D]`` of a quantized attribute, one vector per splat, detached."""
-    rows: Tensor = getattr(splats, attribute).detach().flatten(1)
-    return rows
+    return cast(Tensor, getattr(splats, attribute)).detach().flatten(1)
 
 
 def codes_of(splats: RawSplats, attribute: str, quantizer: Quantizer) -> Tensor:
@@ -87,7 +86,6 @@ def noisy_rows(
             subset[name] = take_rows(tensor, rows)
             continue
         # Call the module, not its forward: hooks of user-made quantizers must run.
-        call: Callable[..., tuple[Tensor, Tensor]] = quantizers[name]  # type: ignore[assignment]
-        quantized, _ = call(tensor.flatten(1), noise(name), rows)
+        quantized, _ = cast(nn.Module, quantizers[name])(tensor.flatten(1), noise(name), rows)
         subset[name] = quantized.reshape(len(rows), *tensor.shape[1:])
     return RawSplats(**subset)

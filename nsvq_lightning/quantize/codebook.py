@@ -22,9 +22,8 @@ def copy_codes(active: Tensor, count: int, generator: torch.Generator) -> Tensor
     """
     rounds = -(-count // len(active))
     order = [shuffled(active, generator) for _ in range(rounds)]
-    copies = active[torch.cat(order)[:count]]
     noise = torch.randn(count, active.shape[1], generator=generator, device=generator.device)
-    return copies + 1e-12 * noise.to(active)
+    return active[torch.cat(order)[:count]] + 1e-12 * noise.to(active)
 
 
 def split_codes(active: Tensor, rows: Tensor, count: int, jitter: float, generator: torch.Generator) -> Tensor:
@@ -187,7 +186,7 @@ class CodebookQuantizer(nn.Module, ABC):
 
     def encode(self, x: Tensor) -> Tensor:
         """Nearest codes ``[N]`` int64 of ``x [N, D]``."""
-        return nearest(x.detach(), self.codebook.detach())
+        return nearest(x, self.codebook)
 
     def decode(self, codes: Tensor) -> Tensor:
         """Codebook rows ``[N, D]`` of ``codes [N]``, differentiable in the codebook."""
@@ -233,7 +232,7 @@ class CodebookQuantizer(nn.Module, ABC):
             if rows is None:
                 new = copy_codes(active, len(replaced), generator)
             else:
-                new = split_codes(active, rows.detach(), len(replaced), jitter, generator)
+                new = split_codes(active, rows, len(replaced), jitter, generator)
             replaced = replaced[: len(new)]
             self._tracker.forget()
             self.codebook[replaced] = new
@@ -297,7 +296,7 @@ class CodebookQuantizer(nn.Module, ABC):
         """Nearest codes ``[V]`` of the rows ``rows [V]`` of ``x [N, D]``."""
         if is_on("distance_bounds"):
             return self._tracker.search(x, self.codebook, rows)
-        return self.encode(x if rows is None else x.detach().index_select(0, rows))
+        return self.encode(x if rows is None else x.index_select(0, rows))
 
     def _frozen_codes(self, count: int, rows: Tensor | None) -> Tensor:
         if count != self.codes.shape[0]:

@@ -3,7 +3,7 @@
 Sums of rows by code, also the gradient of a codebook, have the same bits on any number of threads.
 """
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -64,8 +64,7 @@ def lookup(codebook: Tensor, codes: Tensor, x: Tensor | None = None, rows: Tenso
 
     With ``x [N, D]`` the gradient is also that of its rows ``rows [V]``, or of all of them: it passes straight through.
     """
-    result: Tensor = _Lookup.apply(codebook, codes, x, rows)
-    return result
+    return cast(Tensor, _Lookup.apply(codebook, codes, x, rows))
 
 
 class _Lookup(torch.autograd.Function):
@@ -119,7 +118,6 @@ def kmeans(
     Raises:
         ValueError: A shape does not fit, there is no row, a value is not finite, or a weight is negative.
     """
-    x = x.detach()
     if x.dim() != 2 or x.shape[0] == 0 or k < 1:
         raise ValueError(f"k-means needs rows [N, D] with N > 0 and k > 0, got shape {list(x.shape)} and k = {k}")
     if bad := int((~torch.isfinite(x).all(1)).sum()):
@@ -128,13 +126,13 @@ def kmeans(
         if weight.shape != x.shape[:1] or not (weight >= 0).all() or not (weight > 0).any():
             raise ValueError(f"weight must have shape [{x.shape[0]}], no negative and at least one positive value")
         used = weight > 0
-        x, weight = x[used], weight.detach()[used].double()
+        x, weight = x[used], weight[used].double()
     if start is None:
         distinct = x[distinct_rows(x)]
         if len(distinct) <= k:
             return distinct
         start = rows_far_apart(distinct, k, generator) if spread else distinct[shuffled(distinct, generator)[:k]]
-    centroids = start.detach().clone()
+    centroids = start.clone()
     for _ in range(steps):
         centroids = mean_by_code(x, nearest(x, centroids), centroids, weight)
     return centroids

@@ -1,7 +1,7 @@
 """Noise substitution in vector quantization (NSVQ, Vali and Bäckström 2022), and its relative DiVeQ."""
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -57,8 +57,7 @@ def noise_substitution(
     """
     seed = int(torch.randint(0, 2**63 - 1, (), dtype=torch.int64, device=generator.device, generator=generator))
     rows = torch.arange(len(x), device=x.device) if rows is None else rows
-    result: Tensor = _Substitution.apply(x, codebook, codes, rows, (seed, aim, spread))  # type: ignore[no-untyped-call]
-    return result
+    return cast(Tensor, _Substitution.apply(x, codebook, codes, rows, (seed, aim, spread)))  # type: ignore[no-untyped-call]
 
 
 class _Substitution(torch.autograd.Function):

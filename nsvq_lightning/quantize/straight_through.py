@@ -27,9 +27,8 @@ class StraightThrough(CodebookQuantizer):
     @torch.no_grad()
     def refit(self, x: Tensor, steps: int) -> None:
         """Fit the codebook to the rows ``x [N, D]`` by ``steps`` Lloyd steps from its current state; K stays."""
-        start = self.codebook.detach()
         # With a given start, k-means draws nothing from the generator.
-        self.codebook.copy_(kmeans(x, self.num_codes, seeded(0), steps=steps, start=start))
+        self.codebook.copy_(kmeans(x, self.num_codes, seeded(0), steps=steps, start=self.codebook))
 
 
 class TrainedStraightThrough(CodebookQuantizer):
@@ -106,8 +105,7 @@ class PostHoc(CodebookQuantizer):
         The codebook ignores non-finite rows, which a run drops at its next search.
         """
         if not self.frozen:
-            rows = x.detach()
-            self.fit(rows[rows.isfinite().all(1)])
+            self.fit(x[x.isfinite().all(1)])
         return super().encode(x)
 
     def _search(self, x: Tensor, rows: Tensor | None) -> Tensor:

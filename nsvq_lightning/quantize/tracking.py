@@ -10,7 +10,7 @@ of all (the triangle inequality, as in Hamerly's k-means). In few dimensions the
 """
 
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -159,8 +159,7 @@ class NearestTracker:
 
             if self._on_device is None or not self._on_device.fits(codebook):
                 self._on_device = DeviceTracker(codebook)
-            codes: Tensor = self._on_device.search(x, codebook, chosen)
-            return codes
+            return cast(Tensor, self._on_device.search(x, codebook, chosen))
         numbers = chosen.numpy()
         check_array("rows", numbers, (len(numbers),), INT64)
         if len(numbers) and (numbers[0] < 0 or numbers[-1] >= len(x) or not (numbers[1:] > numbers[:-1]).all()):
