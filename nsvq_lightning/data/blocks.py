@@ -121,8 +121,7 @@ def cut(scene: Scene, count: int) -> list[Block]:
     for index in scene.train:
         rows, cells = points_in_front(points, scene.cameras[index])
         shown[rows] += 1 / np.bincount(cells)[cells]  # a cell is shared by its points
-    level = np.linalg.inv(turn_up(up_of(scene.cameras), "minus-y"))
-    axes = level.T[[0, 2]]
+    axes = np.linalg.inv(turn_up(up_of(scene.cameras), "minus-y")).T[[0, 2]]
     ground = points @ axes.T
 
     def parts(some: Bools, core: Float64s, around: Float64s, number: int) -> list[Block]:
@@ -172,8 +171,7 @@ _SEAM = 0.3
 
 def near_seams(points: Float64s, blocks: Sequence[Block]) -> Bools:
     """Which points ``[P, 3]`` lie where two parts meet."""
-    parts = sum(block.contains(points, _SEAM) for block in blocks)
-    return np.asarray(parts > 1)
+    return np.asarray(sum(block.contains(points, _SEAM) for block in blocks) > 1)
 
 
 # A point in a file: its position, then its colour.

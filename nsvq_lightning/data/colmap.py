@@ -91,8 +91,7 @@ class Pinhole:
         """
         width = max(1, round(self.width * across))
         height = max(1, round(self.height * down))
-        scale = np.diag([width / self.width, height / self.height, 1.0])
-        return Pinhole(scale @ self.K, width, height)
+        return Pinhole(np.diag([width / self.width, height / self.height, 1.0]) @ self.K, width, height)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,8 +217,7 @@ def model_files(root: Path, chosen: str | None = None) -> dict[str, Path]:
 
 def other_models(root: Path) -> list[str]:
     """Folders with a model, up to three levels inside a scene folder."""
-    tables = (path for depth in ("*", "*/*", "*/*/*") for path in root.glob(f"{depth}/[cC]ameras.*"))
-    folders = {path.parent for path in tables}
+    folders = {path.parent for depth in ("*", "*/*", "*/*/*") for path in root.glob(f"{depth}/[cC]ameras.*")}
     return sorted(str(folder.relative_to(root)) for folder in folders if _tables_in(folder))
 
 
@@ -321,8 +319,7 @@ def _camera(row: tables.CameraRow, path: Path) -> Any:
         SceneError: It is damaged.
     """
     has_sides = all(0 < side <= MAX_SIDE for side in (row.width, row.height))
-    is_usable = has_sides and (np.abs(row.params) <= MAX_NUMBER).all() and row.params[0] > 0
-    if not is_usable:
+    if not (has_sides and (np.abs(row.params) <= MAX_NUMBER).all() and row.params[0] > 0):
         raise SceneError(
             f"{path}: camera {row.number} has size {row.width}x{row.height} and parameters "
             f"{', '.join(map(str, row.params))}; needed are sizes from 1 to {MAX_SIDE}, finite numbers and a focal "
@@ -389,9 +386,7 @@ def alignment(model: ColmapModel, other: ColmapModel) -> Float64s:
                 f"{len(shared)} photos of the same name are in both scenes: to align them takes three that were not "
                 "taken from one line"
             )
-    matrix = np.eye(4)
-    matrix[:3] = import_pycolmap().estimate_sim3d(ours, theirs).matrix()
-    return matrix
+    return np.vstack([import_pycolmap().estimate_sim3d(ours, theirs).matrix(), (0, 0, 0, 1)])
 
 
 def _no_model(root: Path, folders: Sequence[str], chosen: str | None) -> SceneError:

@@ -43,7 +43,7 @@ class _Photo(NamedTuple):
 
     def rays(self, pixels: Float64s) -> Float64s:
         """Unit directions ``[M, 3]`` in the world of pixels ``[M, 2]``."""
-        local = np.concatenate([(pixels - self.centre) / self.focal, np.ones((len(pixels), 1))], 1)
+        local = np.c_[(pixels - self.centre) / self.focal, np.ones(len(pixels))]
         return np.asarray(local / np.linalg.norm(local, axis=1, keepdims=True) @ self.rotation)
 
 
@@ -77,7 +77,7 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     Raises:
         SceneError: An image cannot be decoded.
     """
-    known = scene.points.numpy().astype(np.float64)
+    known = scene.points.double().numpy()
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # with several, DIS works in stripes, and its bits depend on how many
     try:
@@ -120,7 +120,7 @@ def _photo(scene: Scene, index: int, known: Float64s) -> _Photo:
     height = round(camera.height * scale)
     pixels, counts = resized(image.numpy(), None if mask is None else mask.numpy(), (width, height))
     edges = edges_of(torch.from_numpy(pixels), None if counts is None else torch.from_numpy(counts))
-    view = camera.viewmat.numpy().astype(np.float64)
+    view = camera.viewmat.double().numpy()
     rotation = view[:3, :3]
     translation = view[:3, 3]
     size = np.array([width / camera.width, height / camera.height])

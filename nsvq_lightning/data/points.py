@@ -102,7 +102,7 @@ def random_points(cameras: list[Camera]) -> Float64s:
     width, height = np.array([(camera.width, camera.height) for camera in cameras])[chosen].T
     x = (across * width - cx) / fx
     y = (down * height - cy) / fy
-    rays = np.stack([x, y, np.ones(count)], axis=1)
+    rays = np.c_[x, y, np.ones(count)]
     local = rays * (2 * distance * away)[:, None]
     points = centres[chosen] + np.einsum("pij,pj->pi", rotations.as_matrix()[chosen], local)
     order = np.argsort(-_sightings(points, cameras), kind="stable")

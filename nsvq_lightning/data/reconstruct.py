@@ -487,11 +487,10 @@ def write_frames(video: Path, folder: Path, count: int, report: Report) -> list[
         SceneError: The file is not a video that can be read.
     """
     total = _frame_count(video)
-    parts = min(count, total)
     names = []
     last = None
     frames = _frames(video, lambda done: report("choosing frames", done, total))
-    for _, part in itertools.groupby(frames, key=lambda frame: frame[0] * parts // total):
+    for _, part in itertools.groupby(frames, key=lambda frame: frame[0] * min(count, total) // total):
         number, picture = max(part, key=lambda frame: sharpness(frame[1]))
         tiny = cv2.resize(picture, (48, 27), interpolation=cv2.INTER_AREA).astype(np.float32)
         if last is not None and np.abs(tiny - last).mean() < STILL:
@@ -504,9 +503,7 @@ def write_frames(video: Path, folder: Path, count: int, report: Report) -> list[
 
 
 def _frame_count(video: Path) -> int:
-    reader = cv2.VideoCapture(str(video))
-    total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
-    reader.release()
+    total = int(cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FRAME_COUNT))
     if total <= 0:  # some containers do not say
         total = sum(1 for _ in _frames(video, lambda _: None))
     if not total:
@@ -517,12 +514,9 @@ def _frame_count(video: Path) -> int:
 def _frames(video: Path, done: Callable[[int], None]) -> Iterator[tuple[int, MatLike]]:
     """The frames with their numbers; ``done`` is called with how many have been used."""
     reader = cv2.VideoCapture(str(video))
-    try:
-        for index in itertools.count():
-            found, picture = reader.read()
-            if not found:
-                return
-            yield index, picture
-            done(index + 1)
-    finally:
-        reader.release()
+    for index in itertools.count():
+        found, picture = reader.read()
+        if not found:
+            return
+        yield index, picture
+        done(index + 1)
