@@ -157,8 +157,7 @@ def floaters(splats: SplatTensors, views: Callable[[], Iterable[View]], render: 
         rest = RawSplats(*(tensor[left] for tensor in raw))
         slope, curvature, error = removal_effects(rest, views(), render, generator(0, number, "floaters"))
         # Of a floater's opacity, the photos want at most a third; 0 of one in front of a finished scene.
-        is_floater = slope < 2 * (1 / 3 - 1) * curvature
-        gain = torch.where(is_floater, -slope - curvature, 0)
+        gain = torch.where(slope < 2 * (1 / 3 - 1) * curvature, -slope - curvature, 0)
         # A gain below this share of the squared error is not seen, and is noise.
         least = 1e-4 * error
         # Of splats in the same pixels, the worst goes first.

@@ -70,8 +70,7 @@ def components(rows: Tensor, weights: Tensor, step: float) -> tuple[Float32s, Fl
     wide = rows.double()
     spread = (wide * weights[:, None]).T @ wide
     axes = torch.linalg.eigh(spread)[1].flip(1).T
-    usual = math.sqrt(float(spread.trace()) / rows.numel())
-    size = step * usual or 1.0
+    size = step * math.sqrt(float(spread.trace()) / rows.numel()) or 1.0
     unit = 2.0 ** round(math.log2(size / FINENESS))
     basis = (axes * (size / unit)).round() * unit
     # What each coefficient would be.
@@ -104,8 +103,6 @@ def _cheapest(places: Tensor, before: Tensor, worth: Tensor) -> Tensor:
     largest = int(torch.maximum(nearest.abs(), before.abs()).max())
     counts = torch.bincount((before + largest).long(), minlength=2 * largest + 1)
     bits = math.log2(len(places) + 1) - (counts + 0.5).log2()
-    nearer_0 = nearest - nearest.sign()
-    choices = torch.stack([nearest, nearer_0, torch.zeros_like(nearest)])
-    distances = (places - choices).square()
-    costs = worth * distances + bits[(choices + largest).long()]
+    choices = torch.stack([nearest, nearest - nearest.sign(), torch.zeros_like(nearest)])
+    costs = worth * (places - choices).square() + bits[(choices + largest).long()]
     return choices.gather(0, costs.argmin(0, keepdim=True))[0]

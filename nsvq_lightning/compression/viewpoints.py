@@ -145,8 +145,7 @@ def likely_cameras(
     draws = np.random.default_rng(seed)
     directions = draws.standard_normal((candidates, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    distances = reach * draws.uniform(1.5, 3.0, (candidates, 1))
-    eyes = middle + distances * directions
+    eyes = middle + reach * draws.uniform(1.5, 3.0, (candidates, 1)) * directions
     targets = middle + reach * 0.6 * draws.standard_normal((candidates, 3))
     across, up, _ = np.abs(eyes - targets).T
     # Straight up or down, a camera has no upright.
@@ -163,6 +162,5 @@ def _detail(splats: SplatTensors, camera: Camera) -> float:
     """Mean difference between neighbouring pixels, times the share of the picture that is covered."""
     view = render(splats, camera)
     image = view.image.clamp(0, 1)
-    across = image.diff(dim=1).abs().mean()
-    down = image.diff(dim=0).abs().mean()
-    return float((across + down) * view.alpha.mean())
+    differences = [image.diff(dim=dim).abs().mean() for dim in (0, 1)]
+    return float(sum(differences) * view.alpha.mean())

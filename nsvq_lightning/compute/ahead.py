@@ -34,13 +34,12 @@ def start() -> None:
     cache = next(kernels())[0]._cache
     if not isinstance(cache, kernel_cache.KernelCache) or cache.is_there():
         return
-    # They find the package where this process has found it.
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     for _ in range(min(4, usable_cores() - 1)):  # more would wait for one another
         with suppress(OSError):
             process = subprocess.Popen(
                 [sys.executable, "-m", __name__],
-                env=environment,
+                # They find the package where this process has found it.
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,

@@ -87,10 +87,9 @@ class Workspace:
     @staticmethod
     def borrow() -> "Workspace":
         """An idle workspace, or a new one."""
-        try:
+        with suppress(IndexError):
             return _IDLE.pop()
-        except IndexError:
-            return Workspace()
+        return Workspace()
 
     def give_back(self) -> None:
         """Offer the workspace to the next render."""
