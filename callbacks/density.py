@@ -274,7 +274,7 @@ class DensityControl(Densification):
         chosen = grown & ~large, grown & large
         clones, parents = (RawSplats(*(tensor[mask] for tensor in detached(splats))) for mask in chosen)
         children = split(parents, self.shrink, generator(module.seed, iteration, "split"))
-        new = RawSplats(*(torch.cat(pair) for pair in zip(clones, children, strict=True)))
+        new = RawSplats(*map(torch.cat, zip(clones, children, strict=True)))
         return self.divide(trainer, module, grown & large, new)
 
     def _prune(self, trainer: Trainer, module: SplatModule, *, huge: bool) -> int:

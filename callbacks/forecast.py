@@ -64,11 +64,10 @@ def grown(scene: Scene, count: int) -> Splats:
     rows = torch.arange(points).repeat(copies)[: max(count, points)]
     copied = RawSplats(*(values[rows] for values in start))
     draw = generator(0, 0, "forecast")
-    shifts = copied.scales.exp() * torch.randn(len(rows), 3, generator=draw)
     # More splats cover the surfaces with smaller ones, and trained ones overlap in many layers. With these two numbers,
     # renders of fox, bonsai and photos of two megapixels take about as long as those of the trained scenes.
     shrunk = copied._replace(
-        means=copied.means + shifts,
+        means=copied.means + copied.scales.exp() * torch.randn(len(rows), 3, generator=draw),
         scales=copied.scales - math.log(copies) / 2 + 0.5,
         opacities=torch.randn(len(rows), generator=draw) - 0.5,
     )
@@ -107,5 +106,4 @@ def iterations_within(minutes: float, trainer: Trainer, module: SplatModule, sch
         first = max(len(scene.points), module.first_points or 0)
         parts = module.stretches(schedule, first, budget)
     seconds = trainer.accumulate_grad_batches * iteration_seconds(scene, parts, trainer.strategy.root_device)
-    iterations = max(1, round(60 * minutes / seconds))
-    return int(trainer.strategy.broadcast(iterations))
+    return int(trainer.strategy.broadcast(max(1, round(60 * minutes / seconds))))

@@ -113,7 +113,7 @@ def split_longest(parents: RawSplats) -> RawSplats:
     opacities = torch.logit(CHILD_OPACITY * parents.opacities.sigmoid())
     child = parents._replace(scales=parents.scales + shrink, opacities=opacities)
     pair = (child._replace(means=parents.means + side * offsets) for side in (1, -1))
-    return RawSplats(*(torch.cat(two) for two in zip(*pair, strict=True)))
+    return RawSplats(*map(torch.cat, zip(*pair, strict=True)))
 
 
 # Growth is idle if it adds at most this share of what it may add, or of what there is.
@@ -286,7 +286,7 @@ class BudgetedGrowth(Densification):
         reference = schedule.reference(iteration)
         late = reference > self.full
         weight, threshold = (statistic, self.late_threshold) if late else (edges, self.grad_threshold)
-        candidates = torch.where(statistic >= threshold, weight, torch.zeros_like(weight))
+        candidates = torch.where(statistic >= threshold, weight, 0)
         progress = min(max((reference - self.start) / (self.full - self.start), 0.0), 1.0)
         room = int(self.limit(module) * math.sqrt(progress)) - len(splats)
         divided = draw_rows(candidates, room, generator(module.seed, iteration, "grow"))

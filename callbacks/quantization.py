@@ -321,14 +321,12 @@ class RateDistortion(SplatCallback):
         if module.schedule.phase_at(iteration) is not Phase.QUANTIZE:
             return
         part = slice((iteration - 1) % TURNS, None, TURNS)
-        if self.is_due(module, iteration) or not self._fits(module):
+        # Where splats were dropped, the prices are those of others.
+        fits = all(len(price) == len(module.splats) for price in (self.prices or {}).values())
+        if self.is_due(module, iteration) or not fits:
             self._measure(trainer, module)
             part = slice(None)
         self._choose(module, part)
-
-    def _fits(self, module: SplatModule) -> bool:
-        """Whether the prices are those of the splats that there are now."""
-        return all(len(price) == len(module.splats) for price in (self.prices or {}).values())
 
     def _measure(self, trainer: Trainer, module: SplatModule) -> None:
         splats, quantizers = module.scene.hard_splats(Phase.QUANTIZE), module.quantizers.items()
@@ -374,7 +372,7 @@ class FiniteCodes(SplatCallback):
         if module.schedule.phase_at(iteration) < Phase.QUANTIZE or not finite_search_is_due(trainer, self.every):
             return
         for name, quantizer in module.quantizers.items():
-            broken = (~torch.isfinite(quantizer.codebook.detach()).all(1)).nonzero()[:, 0]
+            broken = (~torch.isfinite(quantizer.codebook).all(1)).nonzero()[:, 0]
             if len(broken) == 0:
                 continue
             found = f"step {iteration}: {len(broken)} of {len(quantizer.codebook)} codes of {name} are non-finite"
