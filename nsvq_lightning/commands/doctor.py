@@ -277,7 +277,7 @@ def check_overlap(model: "ColmapModel") -> Iterator[Finding]:
     apart = group_of != np.bincount(group_of).argmax()
     weak = np.flatnonzero(apart if groups > 1 else best < 0.3)
     named = some([names[i] for i in weak], 3)
-    usual, least = 100 * float(np.median(best)), 100 * float(best.min())
+    usual, least = 100 * np.median(best), 100 * best.min()
     text = f"a photo shares {usual:.0f} % of its points with its best partner, at least {least:.0f} %"
     advice = f"little for {named}; take photos in between"
     if groups > 1:

@@ -149,8 +149,7 @@ def find_config(name: str) -> str:
 
     A name that is neither is returned unchanged, for the parser to report.
     """
-    plain = Path(name).as_posix().removeprefix("configs/")
-    shipped = folder_of("configs") / plain
+    shipped = folder_of("configs") / Path(name).as_posix().removeprefix("configs/")
     for path in (Path(name), shipped, shipped.with_name(f"{shipped.name}.yaml")):
         if path.is_file():
             return str(path)

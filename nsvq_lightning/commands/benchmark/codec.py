@@ -30,8 +30,7 @@ def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Measu
     fitted = quantize.prepare(splats, scope.codebooks)
     scene = to_compressed(splats, {name: as_quantizer(each.quantizer) for name, each in fitted.items()})
     writers = {".ply": partial(save, splats)}
-    for level in LEVELS:
-        writers[f".nsvq {level}"] = partial(save, scene, storage=Storage(level))
+    writers |= {f".nsvq {level}": partial(save, scene, storage=Storage(level)) for level in LEVELS}
     look = torch.no_grad()(partial(painted, "auto"))
     truths = {".ply": look(splats, workload), ".nsvq": look(scene.decode().raw(), workload)}
     writes = {}

@@ -72,9 +72,8 @@ def prepare(splats: RawSplats, codebooks: str) -> dict[str, Attribute]:
     scene = Splats.from_tensors(*splats)
     shuffled = torch.randperm(len(scene), generator=generator(0, 0, "visible"))
     chosen = shuffled[: int(0.8 * len(scene))].sort().values  # about as many as a camera sees
-    quantizers = build_quantizers(partial(NSVQ, kmeans_steps=1), codebooks, scene)
     prepared = {}
-    for name, module in quantizers.items():
+    for name, module in build_quantizers(partial(NSVQ, kmeans_steps=1), codebooks, scene).items():
         quantizer = cast(CodebookQuantizer, module)
         x = attribute_rows(scene.raw(), name).clone()
         quantizer.fit(x, generator=generator(0, 0, "fit", name))

@@ -67,10 +67,9 @@ class StepClock(Callback):
     @property
     def by_phase(self) -> dict[str, float]:
         """The median step of each phase, in ms."""
-        phases = dict.fromkeys(phase for phase, _ in self.steps)
         return {
             f"{phase.name.lower()} ms": median(took for its_phase, took in self.steps if its_phase == phase)
-            for phase in phases
+            for phase in dict.fromkeys(phase for phase, _ in self.steps)
         }
 
     @property

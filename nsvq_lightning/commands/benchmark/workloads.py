@@ -130,7 +130,7 @@ def _positions(count: int, rng: np.random.Generator) -> Float64s:
     x = rng.uniform(-2.2, 2.2, quarter)
     y = 0.9 + rng.normal(size=quarter) * 0.02
     z = rng.uniform(-2.2, 2.2, quarter)
-    ground = np.stack([x, y, z], 1)
+    ground = np.c_[x, y, z]
     box = rng.uniform(-0.4, 0.4, (tenth, 3))
     axis = rng.integers(0, 3, tenth)
     box[np.arange(tenth), axis] = 0.4 * (rng.integers(0, 2, tenth) * 2 - 1)
@@ -138,8 +138,7 @@ def _positions(count: int, rng: np.random.Generator) -> Float64s:
     cloud = rng.normal(size=(quarter, 3)) * 0.8
     rest = count - 3 * quarter - tenth
     shell = _directions(rng, rest, 3) * rng.uniform(2.5, 3.2, (rest, 1))
-    positions = np.concatenate([sphere, ground, box, cloud, shell])
-    return positions[rng.permutation(count)]
+    return np.concatenate([sphere, ground, box, cloud, shell])[rng.permutation(count)]
 
 
 def _camera(width: int, height: int, target: Float64s, distance: float) -> Camera:
