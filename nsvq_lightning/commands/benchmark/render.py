@@ -17,7 +17,9 @@ from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.compute.devices import devices_with_kernels, fast_backends
 from nsvq_lightning.quality.loss import photometric_loss, plain_loss
 from nsvq_lightning.random import generator
+from nsvq_lightning.rendering.camera import camera_of
 from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.rendering.sampling import Sampling, focal_of
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.self_check import relative_l2
 
@@ -36,6 +38,7 @@ def run(scope: Scope) -> Iterator[Measurement]:
     for device in devices_with_kernels():
         for workload in workloads(scope):
             yield from _render_rows(workload.to(device), scope, device)
+            yield from _size_rows(workload.to(device), scope, device)
         yield from _loss_rows(scope, device)
 
 
@@ -123,6 +126,24 @@ def image_errors(image: Tensor, truth: Tensor) -> tuple[dict[str, float], Tensor
         "pixels above 1e-3": float((error > 1e-3).sum()),
     }
     return errors, usual
+
+
+@torch.no_grad()
+def _size_rows(workload: Workload, scope: Scope, device: str) -> Iterator[Measurement]:
+    """What it takes to keep the blur of training, at its size and at half of it."""
+    camera = workload.camera
+    position = camera.position.to(workload.splats.means)
+    away = (workload.splats.means - position).norm(dim=1)
+    sampling = Sampling(torch.stack([away, away]), [focal_of(camera)])
+    for times in (1, 2):
+        lens = tuple(number / times for number in camera.intrinsics)
+        view = camera_of(camera.viewmat, lens, camera.width // times, camera.height // times, camera.near)
+        cases = {
+            "blur kept": partial(render, workload.splats, view, sampling=sampling),
+            "blur of a pixel": partial(render, workload.splats, view),
+        }
+        described = f"{workload.name}, {view.width}x{view.height}"
+        yield from compare("forward at another size", described, cases, {name: {} for name in cases}, scope, device)
 
 
 PHOTO = (533, 800, 3)
