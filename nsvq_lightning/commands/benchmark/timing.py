@@ -101,7 +101,7 @@ def compare(
     device: str = "cpu",
     prepare: Call | None = None,
 ) -> list[Measurement]:
-    """Time the methods of an operation in turns, in an order that rotates from round to round.
+    """Time the methods of an operation in turns, in an order that rotates, and reverses, from round to round.
 
     The first call of each is not counted: it compiles kernels and grows buffers. A method that has used up
     ``scope.seconds`` sits out the remaining rounds, so that one slow method does not make the run endless; the matrix
@@ -123,7 +123,9 @@ def compare(
     try:
         for turn in range(-1, scope.repeats):
             shift = max(turn, 0) % len(players)
-            for name, call in players[shift:] + players[:shift]:
+            order = players[shift:] + players[:shift]
+            # What follows the matrix product finds no data in the caches: not always the same method.
+            for name, call in order[:: -1 if turn % 2 else 1]:
                 if name and sum(samples[name]) >= 1000 * scope.seconds:
                     continue
                 if name and prepare is not None:
