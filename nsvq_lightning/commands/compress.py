@@ -112,11 +112,12 @@ def run(options: argparse.Namespace) -> int:
         raise argparse.ArgumentError(None, wrong)
     scene = trained_scene(options.input, options.root)
     most = splats_left(options.splats, len(scene))
-    from nsvq_lightning.commands.compressor import Compressor, setting_for
+    from nsvq_lightning.commands.compressor import ON_BASIS, Compressor, setting_for
     from nsvq_lightning.compression.viewpoints import Measure, own_scene
     from nsvq_lightning.data.datamodule import SceneDataModule
 
-    if options.target_bytes is not None:  # what is impossible is said before the scene is looked at
+    # What is impossible is said before the scene is looked at.
+    if options.target_bytes is not None and 8 * options.target_bytes < ON_BASIS * most:
         setting_for(options.target_bytes, most, scene.sh_degree)
     splats = scene.decode()
     cameras, photos = views_of(options.input, splats, VIEWS, options.root)

@@ -13,7 +13,7 @@ from torch import Tensor
 from nsvq_lightning.callbacks import LearningRateDecay, PhaseSchedule, SplatBudget, standard
 from nsvq_lightning.compression import importance
 from nsvq_lightning.compression.stored import components
-from nsvq_lightning.compression.viewpoints import Measure
+from nsvq_lightning.compression.viewpoints import MEASURED, OWN, Measure
 from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.datamodule import SceneDataModule
@@ -23,6 +23,7 @@ from nsvq_lightning.io.nsvq.header import frame, unframe
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.report.numbers import evaluate
 from nsvq_lightning.splats.attributes import ATTRIBUTES, SIZES, attribute_dims, codebook_bits, codebook_sizes
 from nsvq_lightning.splats.splats import Splats, detached
 from nsvq_lightning.training.module import SplatModule
@@ -54,8 +55,8 @@ class Setting:
     more: int = 0
 
 
-# Bits a splat from which on they are on a basis, without any codebooks.
-ON_BASIS = 125
+# Bits a splat from which on a file without any codebooks may be better, and spherical harmonics are then on a basis.
+ON_BASIS = 90
 # Bits of a splat's position and opacity, about.
 PLACE = 22.0
 # Rather than keep fewer splats than this share, a file takes smaller codebooks.
@@ -65,13 +66,11 @@ MIN_SPLATS = 100
 
 
 def setting_for(size: int, most: int, sh_degree: int) -> Setting:
-    """The setting that ``size`` bytes have room for, about, with at most ``most`` splats.
+    """The setting with codebooks that ``size`` bytes have room for, about, with at most ``most`` splats.
 
     Raises:
         ValueError: There is none.
     """
-    if 8 * size >= ON_BASIS * most:
-        return Setting(most, "none", STEPS[0] if sh_degree else 0.0)
     dims = attribute_dims(sh_degree)
     for name in SIZES:
         sizes = {each: (codes, dims[each]) for each, codes in codebook_sizes(name).items() if dims[each]}
@@ -129,7 +128,7 @@ def _turned(setting: Setting, turn: float) -> Setting:
 class Compressor:
     """Compresses one scene at any setting; each pair of codebooks and number of splats is trained at most once.
 
-    Small files have codebooks; in larger ones, spherical harmonics, which lose most by that, are on a basis.
+    Small files have codebooks; in larger ones, spherical harmonics, which lose most by that, may be on a basis instead.
 
     Attributes:
         scene: The scene, finite.
@@ -156,6 +155,7 @@ class Compressor:
         self._splats = detached(self.scene.decode())
         self._render = partial(render, antialiased=self.scene.antialiased)
         views = self.data.scene
+        self._is_own = views.split == OWN
         self._views = {index: views.cameras[index] for index in views.some_train(MAX_VIEWS)}
         # Of settings without steps and shares, which need no training of their own.
         self._trained = cache(self._train)
@@ -193,34 +193,62 @@ class Compressor:
         """Root mean square difference between its pictures and those of the original, for channels in [0, 1]."""
         return self.measure.error(candidate.scene.decode())
 
+    def quality(self, candidate: Candidate) -> float:
+        """PSNR of its pictures in views that it was not trained on, in dB: against their photos, if there are any."""
+        views = self.data.scene
+        some = views.test[:: -(-len(views.test) // MEASURED)]
+        return evaluate(self._render, candidate.scene.decode(), map(views.view, some))[0]
+
     def finest_within(self, target: int, splats: int) -> Candidate:
-        """The best file of at most ``target`` bytes and this many splats.
+        """The best file of at most ``target`` bytes and this many splats: with or without codebooks, by its quality.
 
         Raises:
             ValueError: None was found.
         """
-        best = None
+        found: list[Candidate | None] = []
+        if 8 * target >= ON_BASIS * splats:
+            plain = Setting(splats, "none", STEPS[0] if self.scene.sh_degree else 0.0)
+            exact = self.at(replace(plain, step=0.0))
+            fits = exact if len(exact.data) <= target else self._fitting(plain, target)
+            if fits and (self.stopped or (fits is exact and self._is_own)):
+                return fits
+            found.append(fits)
+        found.append(self._finest_coded(target, splats, needed=not any(found)))
+        fitting = [candidate for candidate in found if candidate]
+        if not fitting:
+            raise ValueError(f"found no file of {target} bytes: allow more {'time' if self.stopped else 'bytes'}")
+        return fitting[0] if len(fitting) == 1 else max(fitting, key=self.quality)
+
+    def _fitting(self, setting: Setting, target: int) -> Candidate | None:
+        """The candidate nearest to the most exact one of at most ``target`` bytes."""
+        return self._between(
+            setting,
+            lambda each: len(each.data) <= target,
+            is_close=lambda size: size >= (1 - SLACK) * target,
+        )
+
+    def _finest_coded(self, target: int, splats: int, needed: bool) -> Candidate | None:
+        """The largest file with codebooks of at most ``target`` bytes; too few are refused only where it is needed."""
+        best = before = None
         asked = float(target)
         for _ in range(ESTIMATES):
-            setting = setting_for(int(asked), splats, self.scene.sh_degree)
-            if setting.codebooks == "none":
-                exact = self.at(replace(setting, step=0.0))
-                if len(exact.data) <= target:
-                    return exact
-            found = self._between(
-                setting,
-                lambda each: len(each.data) <= target,
-                is_close=lambda size: size >= (1 - SLACK) * target,
-            )
+            try:
+                setting = setting_for(int(asked), splats, self.scene.sh_degree)
+            except ValueError:
+                if needed:
+                    raise
+                break
+            found = self._fitting(setting, target)
             if found and (best is None or len(found.data) > len(best.data)):
                 best = found
-            if self.stopped or (found and (setting.step or len(found.data) >= (1 - 2 * SLACK) * target)):
+            # There may be more room than the largest codebooks take.
+            enough = found and (len(found.data) >= (1 - 2 * SLACK) * target or setting == before)
+            if self.stopped or enough:
                 break
+            before = setting
             # What the estimate made of its bytes.
             made = found or self.at(_turned(setting, 1.0))
             asked *= (1 - SLACK / 2) * target / len(made.data)
-        if best is None:
-            raise ValueError(f"found no file of {target} bytes: allow more {'time' if self.stopped else 'bytes'}")
         return best
 
     def smallest_within(self, error: float, splats: int) -> Candidate:
@@ -294,7 +322,7 @@ class Compressor:
             seed=self.seed,
             storage=self.storage,
         )
-        if sizes or prune:
+        if sizes or prune or not self._is_own:  # its own pictures teach nothing new
             phases = PhaseSchedule(
                 total=steps,
                 reference_total=None,

@@ -81,8 +81,12 @@ class Measure:
         return math.sqrt(np.mean([float(difference.double().square().mean()) for difference in differences]))
 
 
+# The split of a scene whose photos are its own pictures.
+OWN = "own pictures"
+
+
 def own_scene(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool = False) -> Scene:
-    """A scene whose photos are pictures of splats, all of them to train on.
+    """A scene whose photos are pictures of splats, one of which in eight is not to train on.
 
     Args:
         splats: Raw attributes.
@@ -102,11 +106,11 @@ def own_scene(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool
         images=ImageStore((), held=[Picture(photo, None) for photo in photos]),
         points=splats.means.detach(),
         colors=torch.zeros_like(splats.means),
-        train=tuple(range(len(cameras))),
-        test=(0,),
+        train=tuple(index for index in range(len(cameras)) if index % 8 != 4),
+        test=tuple(range(4, len(cameras), 8)) or (0,),
         extent=EXTENT * frame.unit,
         frame=frame,
-        split="none",
+        split=OWN,
     )
 
 
