@@ -134,10 +134,6 @@ def photos_of(path: Path) -> Path | None:
     return folder if folder.is_dir() else None
 
 
-def _number(text: str) -> int | None:
-    return int(text) if text.isdigit() else None
-
-
 def _settings_of_run(path: Path) -> dict[str, str]:
     return values_by_name(settings_of([str(_run_of(path) / "config.yaml")]))
 
@@ -160,8 +156,8 @@ def _trained_on(path: Path, root: Path | None) -> "Scene | None":
     if folder is None:
         return None
     settings = _settings_of_run(path)
-    factor, width = (settings.get(f"data.{name}", "") for name in ("factor", "max_width"))
-    return load_scene(folder, _number(factor), _number(width or "1600"))  # type: ignore[arg-type]
+    texts = settings.get("data.factor", ""), settings.get("data.max_width", "1600")
+    return load_scene(folder, *(int(text) if text.isdigit() else None for text in texts))  # type: ignore[arg-type]
 
 
 def cameras_of(path: Path, root: Path | None) -> "dict[str, Camera]":
@@ -199,11 +195,12 @@ def trained_scene(path: Path, root: Path | None, near: Path | None = None) -> "C
     Args:
         path: Scene file.
         root: Scene folder whose photos it was trained on.
-        near: What else the cameras are looked for with, such as the folder of a run.
+        near: What else the cameras are looked for with, such as the folder of a run; what is damaged there is no use,
+            which is a warning.
 
     Raises:
-        SceneError: The folder is not a scene.
-        ValueError: The scene, or what a run has recorded, is damaged.
+        SceneError: The folder ``root`` is not a scene.
+        FormatError: The scene is damaged.
     """
     from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.rendering.sampling import trained_by
@@ -211,7 +208,13 @@ def trained_scene(path: Path, root: Path | None, near: Path | None = None) -> "C
     scene = read_scene(path)
     if len(scene.cameras):
         return scene
-    cameras = list(cameras_of(near or path, root).values())
+    cameras: list[Camera] = []
+    try:
+        cameras = list(cameras_of(near or path, root).values())
+    except (ValueError, OSError) as error:
+        if root is not None:
+            raise
+        log.warning("%s: the cameras of its training cannot be read (%s)", path, error)
     if cameras:
         log.info("%s: blur and size are those of %d cameras that it was trained by", path, len(cameras))
     return replace(scene, cameras=trained_by(cameras))

@@ -80,9 +80,8 @@ def run(options: argparse.Namespace) -> int:
     entry = formats.format_of(output)
     if not output.parent.is_dir() and formats.suffix_of(output) != lod.NAME:
         raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
-    read = formats.read_scene
-    if formats.suffix_of(output) == ".nsvq":  # other formats keep no cameras
-        read = partial(trained_scene, root=options.root)
+    # Other formats keep no cameras.
+    read = partial(trained_scene, root=options.root) if entry.native else formats.read_scene
     scene = _edited(CompressedScene.joined([read(path) for path in options.inputs]), options)
     writer = {"palette": options.palette, "version": options.spz_version, "axes": options.spz_axes}
     given = {name: value for name, value in writer.items() if value is not None}

@@ -104,13 +104,20 @@ def test_cameras_of_inrias_trainer_lie_up_to_two_folders_above_the_scene(tmp_pat
         assert views[0].position.tolist() == [0, 0, -3]
 
 
-def test_a_scene_has_the_cameras_that_lie_beside_it(tmp_path: Path, demo_scene: Path) -> None:
+def test_a_scene_has_the_cameras_that_lie_beside_it(
+    tmp_path: Path, demo_scene: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = tmp_path / "scene.ply"
     save(random_splats(9), path)
     assert len(trained_scene(path, None).cameras) == 0
     assert len(trained_scene(path, demo_scene).cameras) > 5
     (tmp_path / "cameras.json").write_text(json.dumps([ENTRY]))
     assert trained_scene(path, None).cameras.tolist() == [[0, 0, -3, 7]]
+    (tmp_path / "cameras.json").write_text('{"cameras": 7}')
+    assert len(trained_scene(path, None).cameras) == 0
+    assert "cannot be read" in caplog.text
+    with pytest.raises(ValueError, match="does not exist"):
+        trained_scene(path, tmp_path / "gone")
     kept = tmp_path / "scene.nsvq"
     save(replace(read_scene(path), cameras=np.array([[1.0, 2, 3, 9]])), kept)
     assert trained_scene(kept, demo_scene).cameras.tolist() == [[1, 2, 3, 9]]  # its own

@@ -233,12 +233,10 @@ def _cameras(rows: list[Any]) -> tuple[tuple[float, ...], ...]:
 
 
 def _are_numbers(values: Any, count: int) -> bool:
+    if not isinstance(values, list) or len(values) != count:
+        return False
     # Comparing is safe; float() of a huge integer would overflow.
-    return (
-        isinstance(values, list)
-        and len(values) == count
-        and all(type(value) in _NUMBERS and abs(value) <= sys.float_info.max for value in values)
-    )
+    return all(type(value) in _NUMBERS and abs(value) <= sys.float_info.max for value in values)
 
 
 def _rounded(cameras: Float64s) -> tuple[tuple[float, ...], ...]:
