@@ -86,7 +86,7 @@ def _facts(history: Rows, schedule: Schedule, metrics: Values | None) -> dict[st
         quality["LPIPS"] = f"{metrics['lpips']:.4f}"
     return {
         **quality,
-        "PSNR at half size": _decibels(metrics["psnr_half"]),
+        "at half size": _decibels(metrics["psnr_half"]),
         "at a quarter": _decibels(metrics["psnr_quarter"]),
         "file": f"{metrics['file_bytes'] / 1e6:.3f} MB",
         "smaller than .ply": f"{metrics['ratio']:.1f} x",
