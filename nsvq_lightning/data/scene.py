@@ -23,7 +23,7 @@ from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder
 from nsvq_lightning.data.points import random_points
 from nsvq_lightning.data.transforms import read_poses
 from nsvq_lightning.data.undistortion import rectify
-from nsvq_lightning.rendering.camera import Camera, camera_of
+from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
 from nsvq_lightning.splats.conventions import Bools, Float64s
 
@@ -62,13 +62,12 @@ class View:
 
     def smaller(self, times: int) -> "View":
         """The view so many times smaller: each pixel is the mean of a square, and counts if all of the square does."""
-        height, width = self.camera.height // times, self.camera.width // times
+        camera = self.camera.smaller(times)
+        height, width = camera.height, camera.width
 
         def squares(pixels: Tensor) -> Tensor:
             return pixels[: height * times, : width * times].view(height, times, width, times, -1)
 
-        lens = tuple(number / times for number in self.camera.intrinsics)
-        camera = camera_of(self.camera.viewmat, lens, width, height, self.camera.near)
         image = squares(self.image).float().mean((1, 3)).round().to(torch.uint8)
         mask = None if self.mask is None else squares(self.mask).all(3).all(1)[..., 0]
         return replace(self, camera=camera, image=image, mask=mask)

@@ -68,6 +68,11 @@ class Camera:
         """Camera centre ``[3]`` in world coordinates."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
+    def smaller(self, times: int) -> "Camera":
+        """The camera with pixels that are as large as squares of ``times`` pixels; what is left of one is cut off."""
+        lens = tuple(number / times for number in self.intrinsics)
+        return camera_of(self.viewmat, lens, self.width // times, self.height // times, self.near)
+
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None, **_: object) -> "Camera":
         """The camera with both matrices on ``device`` and in ``dtype``; the same object if they already are."""
         K, viewmat = (matrix.to(device=device, dtype=dtype) for matrix in (self.K, self.viewmat))

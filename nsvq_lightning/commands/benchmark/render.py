@@ -18,7 +18,6 @@ from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.compute.devices import devices_with_kernels, fast_backends
 from nsvq_lightning.quality.loss import photometric_loss, plain_loss
 from nsvq_lightning.random import generator
-from nsvq_lightning.rendering.camera import camera_of
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.rendering.sampling import Sampling, focal_of
 from nsvq_lightning.splats.splats import RawSplats
@@ -140,9 +139,8 @@ def _size_rows(workload: Workload, scope: Scope, device: str) -> Iterator[Measur
     }
     trained = render(workload.splats, camera).image
     for times in (1, 2):
-        lens = tuple(number / times for number in camera.intrinsics)
-        width, height = camera.width // times, camera.height // times
-        view = camera_of(camera.viewmat, lens, width, height, camera.near)
+        view = camera.smaller(times)
+        width, height = view.width, view.height
         truth = trained[: height * times, : width * times].view(height, times, width, times, 3).mean((1, 3))
         cases = {name: partial(render, workload.splats, view, **given) for name, given in options.items()}
         errors = {name: {"mean error": float((call().image - truth).abs().mean())} for name, call in cases.items()}
