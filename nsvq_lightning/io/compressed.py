@@ -10,7 +10,7 @@ import numpy as np
 
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.numbers import opacity_of
-from nsvq_lightning.rendering.sampling import Sampling, fewer_cameras
+from nsvq_lightning.rendering.sampling import MAX_CAMERAS, Sampling, fewer_cameras
 from nsvq_lightning.splats import attributes as splat
 from nsvq_lightning.splats.conventions import Arrays, Bools, Float32s, Float64s, Integers, shN_degree, unit
 
@@ -85,8 +85,9 @@ class CompressedScene:
             _check_floats(f"bases[{name!r}]", basis, (max(1, min(len(basis), dims[name])), dims[name]))
         for name, codes in self.codes.items():
             _check_codes(name, codes, self.codebooks[name], n, dims[name])
-        if self.cameras.shape[1:] != (4,) or not (np.isfinite(self.cameras).all() and (self.cameras[:, 3] > 0).all()):
-            raise ValueError("cameras must be rows of a position and a focal length above 0, all finite")
+        fits = self.cameras.shape[1:] == (4,) and len(self.cameras) <= MAX_CAMERAS
+        if not (fits and np.isfinite(self.cameras).all() and (self.cameras[:, 3] > 0).all()):
+            raise ValueError(f"cameras must be at most {MAX_CAMERAS} finite positions and focal lengths above 0")
 
     @classmethod
     def from_splats(cls, splats: "SplatTensors", **header: Any) -> "CompressedScene":

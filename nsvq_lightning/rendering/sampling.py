@@ -81,8 +81,7 @@ class Sampling(NamedTuple):
         """For a camera: its size is relative to that of the photos with the most similar focal length."""
         here = focal_of(camera)
         ratio = min((here / focal for focal in self.focals), key=lambda ratio: abs(math.log(ratio)))
-        same = abs(math.log(ratio)) < SAME_SIZE
-        return ViewSampling(self.distances, 1.0 if same else ratio**2)
+        return ViewSampling(self.distances, 1.0 if abs(math.log(ratio)) < SAME_SIZE else ratio**2)
 
 
 def focal_of(camera: "Camera") -> float:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from compressed_scenes import arrays_of, scene_of
 from compressed_scenes import scene as coded
+from numpy.typing import NDArray
 from viewer_scenes import plain_scene
 
 from nsvq_lightning.io.compressed import CompressedScene, attribute_errors
@@ -40,6 +41,12 @@ def test_joined_scenes_have_the_cameras_of_all() -> None:
     assert parts[0].sampling() is not None
     assert replace(parts[0], config={"antialiased": True}).sampling() is None
     assert coded(20).sampling() is None
+
+
+@pytest.mark.parametrize("cameras", [np.ones((65, 4)), np.ones((2, 3)), np.zeros((1, 4)), np.full((1, 4), np.inf)])
+def test_cameras_that_no_reader_takes_are_refused(cameras: NDArray[np.float64]) -> None:
+    with pytest.raises(ValueError, match="cameras must be at most 64 finite positions"):
+        replace(coded(20), cameras=cameras)
 
 
 def test_known_changes_are_found() -> None:
