@@ -11,7 +11,6 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
-from nsvq_lightning.compression.importance import most_contributing
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
@@ -19,6 +18,7 @@ from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.splats import RawSplats, Splats, detached
 from nsvq_lightning.training import distributed, row_ops, run_scene
+from nsvq_lightning.training.importance import most_contributing
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 

@@ -11,7 +11,6 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
 
-from nsvq_lightning.compression.importance import most_contributing
 from nsvq_lightning.data.images import edges_of
 from nsvq_lightning.data.scene import View, detailed_pixels
 from nsvq_lightning.io.nsvq.precision import Precision
@@ -21,6 +20,7 @@ from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, codebook_bits
 from nsvq_lightning.splats.splats import RawSplats, detached
 from nsvq_lightning.training import distributed, run_scene
+from nsvq_lightning.training.importance import most_contributing
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 

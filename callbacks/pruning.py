@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import torch
 from lightning.pytorch import Trainer
 
-from nsvq_lightning.compression.importance import below_cap, likely_effects, most_contributing
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.training import distributed, row_ops, run_scene
+from nsvq_lightning.training.importance import below_cap, likely_effects, most_contributing
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -58,7 +58,7 @@ class SplatSelection(SplatCallback):
     """When the prune phase starts, removes the splats that the train views miss least, until a budget is left.
 
     Without a splat, a pixel I changes by Δ = -α ∂I/∂α, exactly; splats with the least Σ Δ² over the pixels of the train
-    views go (:func:`nsvq_lightning.compression.importance.sensitivity` estimates it, and it is moved towards what is
+    views go (:func:`nsvq_lightning.training.importance.sensitivity` estimates it, and it is moved towards what is
     typical of a splat's size and opacity). The rest of the phase fits the others to what is missing. Growth to twice
     the budget, and this, is better than growth to the budget (docs/recipe.md).
 

@@ -10,7 +10,6 @@ from lightning.pytorch import Trainer
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nsvq_lightning.compression.importance import row_weights
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import eight_bit
@@ -20,6 +19,7 @@ from nsvq_lightning.quantize.nearest import cheapest, code_rates
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import canonical
 from nsvq_lightning.training import distributed, optim, row_ops, run_scene
+from nsvq_lightning.training.importance import row_weights
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -287,7 +287,7 @@ class RateDistortion(SplatCallback):
     """In the quantize phase, gives every splat the code with the least error + λ · bits instead of the nearest one.
 
     The error is that of the pictures: a code's squared distance times what it does to the train views
-    (:func:`nsvq_lightning.compression.importance.sensitivity`). The bits are −log2 of how many splats have the code.
+    (:func:`nsvq_lightning.training.importance.sensitivity`). The bits are −log2 of how many splats have the code.
     So a splat that is hardly seen, or nearly round, takes a code that many others have, which costs few bits once the
     file is entropy-coded; and training, which renders these codes, makes up for it. The rest of the phase is as
     before, and the codes that splats have in the end are frozen.

@@ -17,10 +17,10 @@ PACKAGE = Path(nsvq_lightning.__file__).parent
 NAME = PACKAGE.name
 FLOORS = (
     {"commands"},
+    {"compression"},
     {"callbacks"},
     {"report"},
     {"training"},
-    {"compression"},
     {"data"},
     {"io"},
     {"rendering", "quantize", "quality"},

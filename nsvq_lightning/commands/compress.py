@@ -25,7 +25,7 @@ from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
 from nsvq_lightning.splats.attributes import SIZES
 
 if TYPE_CHECKING:
-    from nsvq_lightning.commands.compressor import Compressor
+    from nsvq_lightning.compression.compressor import Compressor
     from nsvq_lightning.compression.viewpoints import Measure
 
 DEFAULT_SIZE = "16k"
@@ -112,7 +112,7 @@ def run(options: argparse.Namespace) -> int:
         raise argparse.ArgumentError(None, wrong)
     scene = trained_scene(options.input, options.root)
     most = splats_left(options.splats, len(scene))
-    from nsvq_lightning.commands.compressor import ON_BASIS, Compressor, setting_for
+    from nsvq_lightning.compression.compressor import ON_BASIS, Compressor, setting_for
     from nsvq_lightning.compression.viewpoints import Measure, own_scene
     from nsvq_lightning.data.datamodule import SceneDataModule
 
@@ -133,7 +133,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _write_levels(options: argparse.Namespace, compressor: "Compressor", most: int) -> None:
     """Write a streamed SOG of levels of detail, the finest of ``most`` splats."""
-    from nsvq_lightning.commands.compressor import Setting
+    from nsvq_lightning.compression.compressor import Setting
     from nsvq_lightning.io.formats import save
 
     scene = compressor.scene
@@ -147,7 +147,7 @@ def _write_levels(options: argparse.Namespace, compressor: "Compressor", most: i
 
 def _write_file(options: argparse.Namespace, compressor: "Compressor", most: int, views: str) -> None:
     """Write the ``.nsvq`` file of at most ``most`` splats that is asked for."""
-    from nsvq_lightning.commands.compressor import Setting
+    from nsvq_lightning.compression.compressor import Setting
 
     if options.max_error is not None:
         candidate = compressor.smallest_within(options.max_error, most)

@@ -175,10 +175,10 @@ def _up(options: argparse.Namespace) -> Float64s:
 def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     import torch
 
-    from nsvq_lightning.compression.importance import floaters
     from nsvq_lightning.data.scene import View, load_scene
     from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.report.numbers import evaluate
+    from nsvq_lightning.training.importance import floaters
 
     photos = load_scene(root)
     splats = scene.decode().raw()
@@ -202,8 +202,8 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
 
 def _thinned(scene: CompressedScene, count: int, options: argparse.Namespace) -> CompressedScene:
     """The splats that contribute most to photos of --data.root, or to the scene's own pictures."""
-    from nsvq_lightning.compression.importance import contributions, most_contributing, row_weights
     from nsvq_lightning.rendering.rasterize import render
+    from nsvq_lightning.training.importance import contributions, most_contributing, row_weights
 
     splats = scene.decode()
     cameras, _ = views_of(options.inputs[0], splats, VIEWS, options.root)

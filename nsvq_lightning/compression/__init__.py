@@ -1,1 +1,1 @@
-"""Fewer bytes, the same pictures."""
+"""A scene that is trained already, made small."""

@@ -12,7 +12,6 @@ import torch
 import torch.distributed
 from torch import Tensor
 
-from nsvq_lightning.compression.importance import Renderer
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.compressed import CompressedScene
@@ -22,6 +21,7 @@ from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import eight_bit, psnr
 from nsvq_lightning.splats.conventions import Integers
 from nsvq_lightning.splats.splats import SplatTensors
+from nsvq_lightning.training.importance import Renderer
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 

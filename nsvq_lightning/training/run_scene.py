@@ -10,7 +10,6 @@ from lightning.pytorch import Trainer
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from nsvq_lightning.compression.importance import contributions, sensitivity
 from nsvq_lightning.data.dense_start import dense_points
 from nsvq_lightning.data.scene import ONE_PLACE, Scene, View
 from nsvq_lightning.io.formats import read_scene
@@ -18,6 +17,7 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.frame import EXTENT, Frame
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors
 from nsvq_lightning.training.distributed import sum_over_processes
+from nsvq_lightning.training.importance import contributions, sensitivity
 from nsvq_lightning.training.splat_scene import SplatScene
 
 log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ def needed_scene(trainer: Trainer, need: str, otherwise: str) -> Scene:
 
 
 def train_contributions(trainer: Trainer, trained: SplatScene) -> Tensor:
-    """Blending weight ``[N]`` of each splat in all train views (:mod:`nsvq_lightning.compression.importance`).
+    """Blending weight ``[N]`` of each splat in all train views (:mod:`nsvq_lightning.training.importance`).
 
     Raises:
         ValueError: The trainer has no data module with a scene.
@@ -66,7 +66,7 @@ def train_sensitivities(
 ) -> Iterator[tuple[View, RawSplats, Tensor]]:
     """How much the numbers of splats show in the train views: each view, its estimate and its picture.
 
-    See :func:`nsvq_lightning.compression.importance.sensitivity`.
+    See :func:`nsvq_lightning.training.importance.sensitivity`.
 
     Args:
         trainer: The trainer; several processes share the views.

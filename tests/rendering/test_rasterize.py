@@ -10,7 +10,6 @@ import torch
 from oracle import run
 from splat_scenes import front_camera, random_splats, some_pixel_weights, uneven_splats
 
-from nsvq_lightning.compression.importance import contributions
 from nsvq_lightning.compute.devices import _warn_of_plain_torch, resolve_backend
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import rasterizer
@@ -20,6 +19,7 @@ from nsvq_lightning.rendering.reference import project
 from nsvq_lightning.rendering.sampling import ViewSampling
 from nsvq_lightning.skips import switched
 from nsvq_lightning.splats.splats import RawSplats, Splats
+from nsvq_lightning.training.importance import contributions
 
 assert_same = partial(oracle.assert_same, "cpu")
 DENSE = random_splats(400, seed=5, log_scale=-1.0)

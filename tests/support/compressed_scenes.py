@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nsvq_lightning.compression.stored import components
+from nsvq_lightning.compression.basis import components
 from nsvq_lightning.io import CompressedScene
 from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, attribute_dims
 

@@ -29,7 +29,6 @@ from kernel_entries import entry_points, stand_in_for_a_gpu
 from splat_scenes import front_camera, random_splats, some_pixel_weights
 from torch import Tensor
 
-from nsvq_lightning.compression.importance import row_weights
 from nsvq_lightning.io import formats
 from nsvq_lightning.io.formats import load, save
 from nsvq_lightning.quality.loss import photometric_loss
@@ -38,6 +37,7 @@ from nsvq_lightning.quantize.attributes import decoded, noisy_rows
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.splats.splats import RawSplats, Splats
+from nsvq_lightning.training.importance import row_weights
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 

@@ -11,10 +11,10 @@ from nsvq_lightning.commands.benchmark import quantize
 from nsvq_lightning.commands.benchmark.render import painted
 from nsvq_lightning.commands.benchmark.timing import Measurement, Scope, compare
 from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
-from nsvq_lightning.compression.stored import to_compressed
 from nsvq_lightning.io.formats import load, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.quantize.codebook import as_quantizer
+from nsvq_lightning.training.splat_scene import to_compressed
 
 
 def run(scope: Scope) -> Iterator[Measurement]:

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from nsvq_lightning.callbacks import LearningRateDecay, PhaseSchedule, SplatBudget, standard
-from nsvq_lightning.compression import importance
-from nsvq_lightning.compression.stored import components
+from nsvq_lightning.compression.basis import components
 from nsvq_lightning.compression.viewpoints import MEASURED, OWN, Measure
 from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.compute.memory import trim
@@ -26,6 +25,7 @@ from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.report.numbers import evaluate
 from nsvq_lightning.splats.attributes import ATTRIBUTES, SIZES, attribute_dims, codebook_bits, codebook_sizes
 from nsvq_lightning.splats.splats import Splats, detached
+from nsvq_lightning.training import importance
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.schedule import Phase
@@ -42,7 +42,7 @@ class Setting:
     Attributes:
         splats: How many are left.
         codebooks: The paper's name of their sizes, or "none".
-        step: Of spherical harmonics on a basis (:func:`nsvq_lightning.compression.stored.components`), without
+        step: Of spherical harmonics on a basis (:func:`nsvq_lightning.compression.basis.components`), without
             codebooks; 0 stores them as the others.
         kept: Share of these that are stored.
         more: Codes of spherical harmonics beyond those of the size.

@@ -9,13 +9,6 @@ import torch
 from splat_scenes import front_camera, random_splats
 from torch import Tensor
 
-from nsvq_lightning.compression.importance import (
-    contributions,
-    floaters,
-    most_contributing,
-    row_weights,
-    sensitivity,
-)
 from nsvq_lightning.compression.viewpoints import look_at
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
@@ -23,6 +16,13 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render, render
 from nsvq_lightning.rendering.sh import C0
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
+from nsvq_lightning.training.importance import (
+    contributions,
+    floaters,
+    most_contributing,
+    row_weights,
+    sensitivity,
+)
 from tests.support.splat_scenes import ball
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nsvq_lightning.compression.stored import components
+from nsvq_lightning.compression.basis import components
 from nsvq_lightning.random import generator
 
 

@@ -10,7 +10,7 @@ import pytest
 from ring import cameras_around
 from splat_scenes import ball
 
-from nsvq_lightning.commands.compressor import SLACK, Compressor, Setting, setting_for
+from nsvq_lightning.compression.compressor import SLACK, Compressor, Setting, setting_for
 from nsvq_lightning.compression.viewpoints import Measure, own_scene
 from nsvq_lightning.data.datamodule import SceneDataModule
 from nsvq_lightning.io import CompressedScene
