@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from nsvq_lightning.data.scene import Scene
     from nsvq_lightning.io.compressed import CompressedScene
     from nsvq_lightning.rendering.camera import Camera
+    from nsvq_lightning.splats.conventions import Float32s
     from nsvq_lightning.splats.splats import SplatTensors
 
 
@@ -143,49 +144,83 @@ def _run_of(path: Path) -> Path:
     return path if path.is_dir() else path.parent
 
 
-def _trained_on(path: Path, root: Path | None) -> "Scene | None":
-    """The scene folder ``root``, or else that of the photos that a scene file was trained on, if they are known.
+def folders_beside(path: Path) -> list[Path]:
+    """Where a trainer may have left the cameras of a scene file: in its folder, and up to two above."""
+    run = _run_of(path).resolve()
+    return [run, *run.parents][:3]
 
-    Photos of a run have the size that it has trained with.
+
+def _known_views(path: Path, root: Path | None) -> "tuple[dict[str, Camera], Scene | None]":
+    """Cameras by name of the photos that a scene was trained on, and these photos, if a folder of them is named.
+
+    That is ``root``, or the one in the settings of the scene's run; photos of a run have the size that it has trained
+    with. Cameras that are found are those that a run has recorded, or those in the scene's folder or up to two above.
     """
-    from nsvq_lightning.data.scene import load_scene
-
-    if root is not None:
-        return load_scene(root)
-    folder = photos_of(path)
-    if folder is None:
-        return None
-    settings = _settings_of_run(path)
-    texts = settings.get("data.factor", ""), settings.get("data.max_width", "1600")
-    return load_scene(folder, *(int(text) if text.isdigit() else None for text in texts))  # type: ignore[arg-type]
-
-
-def cameras_of(path: Path, root: Path | None) -> "dict[str, Camera]":
-    """Cameras by name of the photos that a scene was trained on; where these are gone, what its run has recorded.
-
-    A run of INRIA's trainer has recorded them in ``cameras.json`` beside the file or one or two folders above it.
-
-    Args:
-        path: A scene file, or the folder of a run; without a run, there are none.
-        root: Scene folder whose cameras they are instead.
-
-    Raises:
-        SceneError: The folder is not a scene.
-        ValueError: ``viewer.html`` or ``cameras.json`` of the run is damaged.
-    """
+    from nsvq_lightning.data.colmap import NoPhotosError
+    from nsvq_lightning.data.scene import load_cameras, load_scene
+    from nsvq_lightning.data.transforms import has_poses
     from nsvq_lightning.rendering.camera_paths import CAMERAS, read_cameras
     from nsvq_lightning.report.viewer import page_cameras
 
-    scene = _trained_on(path, root)
-    if scene is not None:
-        return dict(zip(scene.names, scene.cameras, strict=True))
-    folder = _run_of(path).resolve()
-    page = folder / "viewer.html"
-    if page.is_file():
-        return page_cameras(page)
-    for place in [folder, *folder.parents][:3]:
+    folder = root or photos_of(path)
+    run = _run_of(path).resolve()
+    if folder is not None and (has_poses(folder) or not (folder / CAMERAS).is_file()):
+        settings = {} if root else _settings_of_run(path)
+        texts = settings.get("data.factor", ""), settings.get("data.max_width", "1600")
+        size = [int(text) if text.isdigit() else None for text in texts]
+        try:
+            scene = load_scene(folder, *size)  # type: ignore[arg-type]
+        except NoPhotosError:
+            log.info("%s has cameras, but no photos", folder)
+            return load_cameras(folder, *size), None  # type: ignore[arg-type]
+        return dict(zip(scene.names, scene.cameras, strict=True)), scene
+    if folder is None and (run / "viewer.html").is_file():
+        return page_cameras(run / "viewer.html"), None
+    for place in [folder] if folder else folders_beside(path):
         if (place / CAMERAS).is_file():
-            return read_cameras(place / CAMERAS)
+            return read_cameras(place / CAMERAS), None
+        if has_poses(place):
+            return load_cameras(place), None
+    return {}, None
+
+
+# Share of a scene's splats that its cameras show at least. On six scenes, their own cameras show 99 %; with y and z
+# turned round or exchanged, 43 % at most.
+MIN_SHOWN = 0.8
+# So many of them are asked, at most.
+SOME_CAMERAS = 300
+SOME_SPLATS = 20_000
+
+
+def cameras_of(path: Path, root: Path | None, means: "Float32s | None" = None) -> "dict[str, Camera]":
+    """Cameras by name of the photos that a scene was trained on, or that its run or trainer has left beside it.
+
+    They are looked for as ``viewer.html`` in the folder of a run, as ``cameras.json`` of INRIA's trainer, as a COLMAP
+    model or as a transforms file.
+
+    Args:
+        path: A scene file, or the folder of a run.
+        root: Folder whose cameras they are instead; it needs no photos.
+        means: Positions of the scene ``[N, 3]``: cameras that do not show it are not its own, which is a warning.
+
+    Raises:
+        SceneError: The folder is not a scene.
+        ValueError: What the run has recorded is damaged, or the cameras of ``root`` do not show the scene.
+    """
+    from nsvq_lightning.data.points import share_shown
+
+    cameras, _ = _known_views(path, root)
+    if means is None or not cameras or not len(means):
+        return cameras
+    views = list(cameras.values())[:: math.ceil(len(cameras) / SOME_CAMERAS)]
+    places = means[:: math.ceil(len(means) / SOME_SPLATS)]
+    shown = share_shown(places.astype("f8"), views)
+    if shown >= MIN_SHOWN:
+        return cameras
+    others = "they are of another scene, or in other coordinates"
+    if root is not None:
+        raise ValueError(f"{root}: its {len(cameras)} cameras show {shown:.0%} of the splats of {path}: {others}")
+    log.warning("%s: cameras beside it show %.0f %% of its splats and are not used: %s", path, 100 * shown, others)
     return {}
 
 
@@ -194,7 +229,7 @@ def trained_scene(path: Path, root: Path | None, near: Path | None = None) -> "C
 
     Args:
         path: Scene file.
-        root: Scene folder whose photos it was trained on.
+        root: Folder with the cameras of the photos that it was trained on.
         near: What else the cameras are looked for with, such as the folder of a run; what is damaged there is no use,
             which is a warning.
 
@@ -210,7 +245,7 @@ def trained_scene(path: Path, root: Path | None, near: Path | None = None) -> "C
         return scene
     cameras: list[Camera] = []
     try:
-        cameras = list(cameras_of(near or path, root).values())
+        cameras = list(cameras_of(near or path, root, scene.means).values())
     except (ValueError, OSError) as error:
         if root is not None:
             raise
@@ -224,21 +259,21 @@ def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -
     """At most ``most`` views of a scene file in which its pictures count, and its photos if they are known.
 
     Args:
-        path: The file. In the folder of a run, they are those of its train photos, or what the run has recorded.
-        splats: Raw attributes of N > 0 splats; without a run, views are those from where they show detail.
+        path: The file.
+        splats: Raw attributes of N > 0 splats; where no cameras are known, views are those from where they show detail.
         most: Number of views.
-        root: Scene folder whose train photos they are instead.
+        root: Folder of the cameras, with their photos or without.
 
     Raises:
         SceneError: The folder is not a scene.
     """
     from nsvq_lightning.compression.viewpoints import likely_cameras
 
-    scene = _trained_on(path, root)
-    if scene is not None:
-        return [scene.cameras[index] for index in scene.some_train(most)], scene
-    recorded = list(cameras_of(path, None).values())
-    if recorded:
-        return recorded[:: math.ceil(len(recorded) / most)], None
-    # A square picture with the pixels of a photo: what a wide one shows at its edges, photos seldom do.
-    return likely_cameras(splats, most, 640, 640, degrees=50), None
+    known = list(cameras_of(path, root, splats.means.detach().cpu().numpy()).values())
+    if not known:
+        # A square picture with the pixels of a photo: what a wide one shows at its edges, photos seldom do.
+        return likely_cameras(splats, most, 640, 640, degrees=50), None
+    _, photos = _known_views(path, root)
+    if photos is None:
+        return known[:: math.ceil(len(known) / most)], None
+    return [photos.cameras[index] for index in photos.some_train(most)], photos

@@ -21,7 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import add_root, trained_scene, views_of
+from nsvq_lightning.commands.arguments import add_root, cameras_of, trained_scene, views_of
 from nsvq_lightning.commands.compress import VIEWS, share_or_number, splats_left, written_error
 from nsvq_lightning.io import formats, lod, placing, spz
 from nsvq_lightning.io.compressed import CompressedScene, attribute_errors
@@ -161,10 +161,9 @@ def _edited(scene: CompressedScene, options: argparse.Namespace) -> CompressedSc
 def _up(options: argparse.Namespace) -> Float64s:
     """Where up is in the input, a unit vector ``[3]``."""
     if options.up_from is None:
-        from nsvq_lightning.data.scene import load_scene
         from nsvq_lightning.rendering.poses import up_of
 
-        return up_of(load_scene(options.root).cameras)
+        return up_of(list(cameras_of(options.inputs[0], options.root).values()))
     up = np.array(options.up_from)
     length = float(np.linalg.norm(up))
     if not 0 < length < np.inf:

@@ -113,7 +113,7 @@ def _path(options: argparse.Namespace, splats: "Splats", is_video: bool) -> "tup
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.rendering.camera_paths import orbit, read_camera_path, reframed, smooth_path
 
-    cameras = list(cameras_of(options.scene, options.root).values())
+    cameras = list(cameras_of(options.scene, options.root, splats.means.detach().numpy()).values())
     kind = options.path or ("through" if cameras else "orbit")
     fps = options.fps or FPS
     if kind not in ("through", "cameras", "orbit"):

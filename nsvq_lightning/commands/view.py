@@ -115,13 +115,13 @@ def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.io.formats import load
 
-    cameras = cameras_of(options.scene, options.root)
+    splats = None if options.live else load(file)
+    cameras = cameras_of(options.scene, options.root, None if splats is None else splats.means.detach().numpy())
     if cameras:
         every = math.ceil(len(cameras) / MAX_CAMERAS)
         return dict(islice(cameras.items(), 0, None, every))
-    if options.live:
+    if splats is None:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
-    splats = load(file)
     sys.stderr.write("no photos: cameras are guessed from the scene; --data.root names the folder of the photos\n")
     return {f"guess {index}": camera for index, camera in enumerate(likely_cameras(splats, 12), 1)}
 

@@ -35,6 +35,10 @@ class SceneError(ValueError):
     """A scene folder that cannot be used; the message names the file, what is wrong with it and what to do."""
 
 
+class NoPhotosError(SceneError):
+    """A scene folder has cameras, but none of their photos."""
+
+
 # Pixels; a camera with a larger side is damaged.
 MAX_SIDE = (1 << 20) - 1
 # Relative error of a quaternion's length that comes from writing its numbers with few digits.

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
-from nsvq_lightning.data.colmap import ColmapImage, SceneError, check_name, is_outside
+from nsvq_lightning.data.colmap import ColmapImage, NoPhotosError, SceneError, check_name, is_outside
 
 log = logging.getLogger(__name__)
 
@@ -126,7 +126,8 @@ def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]
         names: The photos.
 
     Raises:
-        SceneError: None has the photos, or several have.
+        NoPhotosError: None has the photos.
+        SceneError: Several have.
     """
     scaled = root / f"{name}_{factor}"
     if factor is not None and factor > 1 and scaled.is_dir():
@@ -138,7 +139,7 @@ def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]
     found = [path for path in (root, *folders) if all((path / given).is_file() for given in plain)]
     if len(found) != 1:
         others = " and ".join(str(path.relative_to(root)) for path in found)
-        raise SceneError(
+        raise (SceneError if found else NoPhotosError)(
             f"image folder {root / name} does not exist: copy the photos there, or set images_folder (or factor, for "
             f"{name}_2, _4 and _8); they are in {others or 'no other folder'}"
         )

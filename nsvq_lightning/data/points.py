@@ -12,7 +12,7 @@ from nsvq_lightning.io.ply import PlyHeader, read_ply_columns, read_ply_header
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.poses import looked_at, poses
-from nsvq_lightning.splats.conventions import SH_C0, Float64s, Int64s, Uint8s
+from nsvq_lightning.splats.conventions import SH_C0, Bools, Float64s, Int64s, Uint8s
 
 
 def read_points(path: Path) -> tuple[Float64s, Uint8s]:
@@ -72,6 +72,15 @@ def cloud_in(folders: list[Path]) -> Path | None:
     return None
 
 
+def share_shown(points: Float64s, cameras: list[Camera]) -> float:
+    """Share of points ``[P, 3]`` that a camera has in its picture, or of cameras that have a thousandth of the points.
+
+    Walls are disregarded. It is the smaller of the two shares; P > 0.
+    """
+    seen = np.stack([_in_picture(points, camera) for camera in cameras])
+    return float(min(seen.any(0).mean(), (seen.mean(1) > 1e-3).mean()))
+
+
 def share_seen(points: Float64s, cameras: list[Camera]) -> float:
     """Mean share of the cameras that have a point in their picture, walls disregarded."""
     return float(_sightings(points, cameras).sum()) / max(1, len(points) * len(cameras))
@@ -113,9 +122,13 @@ def _sightings(points: Float64s, cameras: list[Camera]) -> Int64s:
     """Number of cameras ``[P]`` that have each point in their picture."""
     seen = np.zeros(len(points), np.int64)
     for camera in cameras:
-        column, row, _ = projected(points, camera)
-        seen += (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        seen += _in_picture(points, camera)
     return seen
+
+
+def _in_picture(points: Float64s, camera: Camera) -> Bools:
+    column, row, _ = projected(points, camera)
+    return (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
 
 
 def projected(points: Float64s, camera: Camera) -> tuple[Float64s, Float64s, Float64s]:

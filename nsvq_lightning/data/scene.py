@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.compute.environment import usable_cores
-from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, larger_models
+from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, NoPhotosError, Pinhole, SceneError, larger_models
 from nsvq_lightning.data.images import ImageSource, ImageStore, Picture, head_for, high_pass, same_shape
 from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder
 from nsvq_lightning.data.points import random_points
@@ -175,6 +175,7 @@ def load_scene(
         allow_outside: Also read photos and masks that the model names outside the scene folder.
 
     Raises:
+        NoPhotosError: All photos are missing; :func:`load_cameras` needs none.
         SceneError: The folder, the model or a photo is missing, the model is damaged, or the split leaves no train
             view.
         ValueError: An argument is out of range.
@@ -209,7 +210,7 @@ def load_scene(
     files = [found[name] for name in names]
     lost = [name for name in names if not found[name].is_file()]
     if lost:
-        raise SceneError(
+        raise (NoPhotosError if len(lost) == len(names) else SceneError)(
             f"{len(lost)} of {len(names)} images of the model are not in {folder}, first {lost[0]}: "
             "copy the photos that COLMAP was run on into that folder, under the same names"
         )
@@ -219,7 +220,8 @@ def load_scene(
         mask_files = find_masks(poses.images, files, folder, root, mask_folders)
     sources = _image_sources(poses, files, mask_files, divisor, max_width if factor is None else None)
     poses, frame = _framed(poses, root)
-    cameras = tuple(_camera(image, source, frame) for image, source in zip(poses.images, sources, strict=True))
+    pairs = zip(poses.images, sources, strict=True)
+    cameras = tuple(_camera(image, source.pinhole, frame) for image, source in pairs)
     if not len(poses.points):
         points = random_points([cameras[index] for index in train])
         log.info("%s has no points: %d random ones in what the cameras see take their place", root, len(points))
@@ -278,12 +280,31 @@ def _image_sources(
     for kind in dict.fromkeys(kinds):
         number, size = kind
         full, undistortion = rectify(model.cameras[number], *size, keep_maps=keep_maps)
-        scale = 1 / divisor if max_width is None or full.width <= max_width else max_width / full.width
-        lenses[kind] = undistortion, full.scaled(scale, scale)
+        lenses[kind] = undistortion, _scaled(full, divisor, max_width)
     return [
         ImageSource(path, head.size, *lenses[kind], head.orientation, mask, head.has_alpha, model.synthetic)
         for path, head, kind, mask in zip(paths, heads, kinds, masks, strict=True)
     ]
+
+
+def _scaled(lens: Pinhole, divisor: int, max_width: int | None) -> Pinhole:
+    scale = 1 / divisor if max_width is None or lens.width <= max_width else max_width / lens.width
+    return lens.scaled(scale, scale)
+
+
+def load_cameras(root: str | Path, factor: Factor | None = None, max_width: int | None = 1600) -> dict[str, Camera]:
+    """Cameras of a scene folder by the names of its photos, which need not be there; those of :func:`load_scene`.
+
+    Raises:
+        SceneError: There is no model, or it is damaged; or it does not say how large the photos are.
+    """
+    root = Path(root).expanduser()
+    poses, frame = _framed(read_poses(root, allow_outside=True), root)
+    lenses = {}
+    for number, lens in poses.cameras.items():
+        full, _ = rectify(lens, lens.width, lens.height, keep_maps=False)
+        lenses[number] = _scaled(full, factor or 1, max_width if factor is None else None)
+    return {image.name: _camera(image, lenses[image.camera_id], frame) for image in poses.images}
 
 
 S = TypeVar("S")
@@ -363,14 +384,13 @@ def astray(places: Float64s, times: float) -> Bools:
     return np.asarray((distances > times * usual) & (usual > 0))
 
 
-def _camera(image: ColmapImage, source: ImageSource, frame: Frame) -> Camera:
-    lens = source.pinhole
+def _camera(image: ColmapImage, lens: Pinhole, frame: Frame) -> Camera:
     pose = torch.from_numpy(image.viewmat)
     try:
         camera = Camera(torch.from_numpy(lens.K), pose, lens.width, lens.height, frame.near)
         return camera.to(dtype=torch.float32)
     except ValueError as error:
-        raise SceneError(f"camera {image.camera_id} of image {source.path}: {error}; run COLMAP again") from error
+        raise SceneError(f"camera {image.camera_id} of image {image.name}: {error}; run COLMAP again") from error
 
 
 # Distance from a camera's centre, in extents, within which a point is a failed triangulation, not a surface.

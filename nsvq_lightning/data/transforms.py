@@ -61,6 +61,11 @@ def read_poses(
     return replace(poses, points=points, colors=colors)
 
 
+def has_poses(root: Path) -> bool:
+    """Whether a folder has a COLMAP model or a transforms file, for :func:`read_poses`."""
+    return bool(colmap.find_model(root) or _files_in(root))
+
+
 def _files_in(root: Path) -> list[Path]:
     """The transforms file of a folder, or that of the train views and the one of the test views; maybe none."""
     single, train, test, val = (root / f"transforms{part}.json" for part in ("", "_train", "_test", "_val"))

@@ -2,11 +2,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from splat_scenes import random_splats
 
 from nsvq_lightning.commands.arguments import (
@@ -22,6 +24,7 @@ from nsvq_lightning.commands.arguments import (
     unknown_option,
     views_of,
 )
+from nsvq_lightning.data.scene import load_cameras, load_scene
 from nsvq_lightning.io.formats import read_scene, save
 
 
@@ -88,7 +91,7 @@ def test_a_run_says_where_its_photos_are(tmp_path: Path) -> None:
     assert photos_of(tmp_path) is None
 
 
-ENTRY = {"img_name": "a", "width": 8, "height": 6, "fx": 7, "fy": 7, "position": [0, 0, -3]}
+ENTRY = {"img_name": "a", "width": 8, "height": 6, "fx": 7, "fy": 7, "position": [0, 0, -6]}
 ENTRY["rotation"] = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 
@@ -101,7 +104,7 @@ def test_cameras_of_inrias_trainer_lie_up_to_two_folders_above_the_scene(tmp_pat
     if above < 3:
         views, photos = views_of(scene, random_splats(9), 5, None)
         assert ([(view.width, view.height) for view in views], photos) == ([(8, 6)], None)
-        assert views[0].position.tolist() == [0, 0, -3]
+        assert views[0].position.tolist() == [0, 0, -6]
 
 
 def test_a_scene_has_the_cameras_that_lie_beside_it(
@@ -112,7 +115,7 @@ def test_a_scene_has_the_cameras_that_lie_beside_it(
     assert len(trained_scene(path, None).cameras) == 0
     assert len(trained_scene(path, demo_scene).cameras) > 5
     (tmp_path / "cameras.json").write_text(json.dumps([ENTRY]))
-    assert trained_scene(path, None).cameras.tolist() == [[0, 0, -3, 7]]
+    assert trained_scene(path, None).cameras.tolist() == [[0, 0, -6, 7]]
     (tmp_path / "cameras.json").write_text('{"cameras": 7}')
     assert len(trained_scene(path, None).cameras) == 0
     assert "cannot be read" in caplog.text
@@ -137,3 +140,52 @@ def test_no_cameras_are_found_where_there_are_none(tmp_path: Path, monkeypatch: 
     Path("cameras.json").write_text("[{}]")
     with pytest.raises(ValueError, match=r"cameras\.json is no list of cameras as INRIA's trainer writes it"):
         cameras_of(Path("scene.ply"), None)
+
+
+def _without_photos(scene: Path, folder: Path) -> Path:
+    """A scene folder with the COLMAP model of another one."""
+    shutil.copytree(scene / "sparse", folder / "sparse")
+    return folder
+
+
+def test_cameras_need_no_photos(tmp_path: Path, demo_scene: Path) -> None:
+    expected = load_scene(demo_scene)
+    points = expected.points[:50]
+    splats = random_splats(50)._replace(means=points)
+    root = _without_photos(demo_scene, tmp_path / "scene")
+    path = tmp_path / "a" / "b" / "c.ply"
+    path.parent.mkdir(parents=True)
+    assert cameras_of(path, None) == {}
+    for found in (cameras_of(path, root), load_cameras(root)):
+        assert tuple(found) == expected.names
+        assert all(
+            torch.equal(one.viewmat, other.viewmat) for one, other in zip(found.values(), expected.cameras, strict=True)
+        )
+        assert [camera.intrinsics for camera in found.values()] == [each.intrinsics for each in expected.cameras]
+    views, photos = views_of(path, splats, 4, root)
+    assert (len(views), photos) == (3, None)
+    _without_photos(demo_scene, tmp_path / "a")  # beside the scene, a folder above
+    assert tuple(cameras_of(path, None)) == expected.names
+
+
+def test_cameras_of_another_scene_are_not_used(
+    tmp_path: Path, demo_scene: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = _without_photos(demo_scene, tmp_path / "scene")
+    path = root / "scene.ply"
+    points = load_scene(demo_scene).points
+    own = random_splats(len(points))._replace(means=points)
+    moved = own._replace(means=points + 20)
+    for splats, count in ((own, 9), (moved, 0)):
+        save(splats, path)
+        assert len(trained_scene(path, None).cameras) == count
+        assert len(cameras_of(path, None, splats.means.numpy())) == count
+    assert "of its splats and are not used: they are of another scene, or in other coordinates" in caplog.text
+    for wrong in (root, demo_scene):
+        with pytest.raises(ValueError, match=r"its 9 cameras show \d+% of the splats of .*: they are of another scene"):
+            views_of(path, moved, 4, wrong)
+
+
+def test_the_folder_of_a_trainer_may_be_named(tmp_path: Path) -> None:
+    (tmp_path / "cameras.json").write_text(json.dumps([ENTRY]))
+    assert list(cameras_of(Path("elsewhere/scene.ply"), tmp_path)) == ["a"]
