@@ -19,21 +19,25 @@ _HOME = {
     "SplatModule": "nsvq_lightning.training.module",
     "SplatTrainer": "nsvq_lightning.training.trainer",
     "Splats": "nsvq_lightning.splats.splats",
+    "compress": "nsvq_lightning.compression.compressor",
     "load": "nsvq_lightning.io.formats",
     "render": "nsvq_lightning.rendering.rasterize",
     "save": "nsvq_lightning.io.formats",
 }
 
 if TYPE_CHECKING:
-    from nsvq_lightning.data.datamodule import ColmapDataModule
-    from nsvq_lightning.io.formats import load, save
-    from nsvq_lightning.rendering.camera import Camera
-    from nsvq_lightning.rendering.rasterize import Render, render
-    from nsvq_lightning.splats.splats import Splats
-    from nsvq_lightning.training.module import SplatModule
-    from nsvq_lightning.training.trainer import SplatTrainer
+    from nsvq_lightning.compression.compressor import compress as compress
+    from nsvq_lightning.data.datamodule import ColmapDataModule as ColmapDataModule
+    from nsvq_lightning.io.formats import load as load
+    from nsvq_lightning.io.formats import save as save
+    from nsvq_lightning.rendering.camera import Camera as Camera
+    from nsvq_lightning.rendering.rasterize import Render as Render
+    from nsvq_lightning.rendering.rasterize import render as render
+    from nsvq_lightning.splats.splats import Splats as Splats
+    from nsvq_lightning.training.module import SplatModule as SplatModule
+    from nsvq_lightning.training.trainer import SplatTrainer as SplatTrainer
 
-__all__ = ["Camera", "ColmapDataModule", "Render", "SplatModule", "SplatTrainer", "Splats", "load", "render", "save"]
+__all__ = [*_HOME]
 
 find_callbacks()
 

@@ -184,14 +184,6 @@ def _known_views(path: Path, root: Path | None) -> "tuple[dict[str, Camera], Sce
     return {}, None
 
 
-# Share of a scene's splats that its cameras show at least. On six scenes, their own cameras show 99 %; with y and z
-# turned round or exchanged, 43 % at most.
-MIN_SHOWN = 0.8
-# So many of them are asked, at most.
-SOME_CAMERAS = 300
-SOME_SPLATS = 20_000
-
-
 def cameras_of(path: Path, root: Path | None, means: "Float32s | None" = None) -> "dict[str, Camera]":
     """Cameras by name of the photos that a scene was trained on, or that its run or trainer has left beside it.
 
@@ -207,31 +199,29 @@ def cameras_of(path: Path, root: Path | None, means: "Float32s | None" = None) -
         SceneError: The folder is not a scene.
         ValueError: What the run has recorded is damaged, or the cameras of ``root`` do not show the scene.
     """
-    from nsvq_lightning.data.points import share_shown
+    from nsvq_lightning.compression.viewpoints import check_cameras
 
     cameras, _ = _known_views(path, root)
     if means is None or not cameras or not len(means):
         return cameras
-    views = list(cameras.values())[:: math.ceil(len(cameras) / SOME_CAMERAS)]
-    places = means[:: math.ceil(len(means) / SOME_SPLATS)]
-    shown = share_shown(places.astype("f8"), views)
-    if shown >= MIN_SHOWN:
-        return cameras
-    others = "they are of another scene, or in other coordinates"
-    if root is not None:
-        raise ValueError(f"{root}: its {len(cameras)} cameras show {shown:.0%} of the splats of {path}: {others}")
-    log.warning("%s: cameras beside it show %.0f %% of its splats and are not used: %s", path, 100 * shown, others)
-    return {}
+    try:
+        check_cameras(list(cameras.values()), means)
+    except ValueError as error:
+        if root is not None:
+            raise ValueError(f"{root} and {path} do not belong together: {error}") from None
+        log.warning("%s: the cameras beside it are not used: %s", path, error)
+        return {}
+    return cameras
 
 
-def trained_scene(path: Path, root: Path | None, near: Path | None = None) -> "CompressedScene":
+def trained_scene(path: Path, root: Path | None) -> "CompressedScene":
     """A scene with the cameras of its training, where these are known: its own, or those of :func:`cameras_of`.
+
+    What is damaged beside it is no use, which is a warning.
 
     Args:
         path: Scene file.
         root: Folder with the cameras of the photos that it was trained on.
-        near: What else the cameras are looked for with, such as the folder of a run; what is damaged there is no use,
-            which is a warning.
 
     Raises:
         SceneError: The folder ``root`` is not a scene.
@@ -245,7 +235,7 @@ def trained_scene(path: Path, root: Path | None, near: Path | None = None) -> "C
         return scene
     cameras: list[Camera] = []
     try:
-        cameras = list(cameras_of(near or path, root, scene.means).values())
+        cameras = list(cameras_of(path, root, scene.means).values())
     except (ValueError, OSError) as error:
         if root is not None:
             raise

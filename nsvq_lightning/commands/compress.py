@@ -22,16 +22,13 @@ from nsvq_lightning.io.atomic import write_bytes
 from nsvq_lightning.io.formats import FORMATS
 from nsvq_lightning.io.lod import NAME
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
-from nsvq_lightning.splats.attributes import SIZES
+from nsvq_lightning.splats.attributes import DEFAULT_SIZE, SIZES
 
 if TYPE_CHECKING:
     from nsvq_lightning.compression.compressor import Compressor
     from nsvq_lightning.compression.viewpoints import Measure
 
-DEFAULT_SIZE = "16k"
 LOD_LEVELS = 3
-# Number of own pictures.
-VIEWS = 96
 
 
 def share_or_number(text: str) -> float:
@@ -113,17 +110,22 @@ def run(options: argparse.Namespace) -> int:
     scene = trained_scene(options.input, options.root)
     most = splats_left(options.splats, len(scene))
     from nsvq_lightning.compression.compressor import ON_BASIS, Compressor, setting_for
-    from nsvq_lightning.compression.viewpoints import Measure, own_scene
-    from nsvq_lightning.data.datamodule import SceneDataModule
+    from nsvq_lightning.compression.viewpoints import VIEWS
 
     # What is impossible is said before the scene is looked at.
     if options.target_bytes is not None and 8 * options.target_bytes < ON_BASIS * most:
         setting_for(options.target_bytes, most, scene.sh_degree)
     splats = scene.decode()
     cameras, photos = views_of(options.input, splats, VIEWS, options.root)
-    measure = Measure(splats, cameras, scene.antialiased)
-    data = SceneDataModule(photos or own_scene(splats, cameras, scene.antialiased), options.seed)
-    compressor = Compressor(scene, data, measure, Storage(options.level), options.seed, options.minutes, options.steps)
+    compressor = Compressor.from_views(
+        scene,
+        cameras,
+        photos,
+        storage=Storage(options.level),
+        seed=options.seed,
+        minutes=options.minutes,
+        steps=options.steps,
+    )
     if streamed:
         _write_levels(options, compressor, most)
     else:
@@ -147,14 +149,7 @@ def _write_levels(options: argparse.Namespace, compressor: "Compressor", most: i
 
 def _write_file(options: argparse.Namespace, compressor: "Compressor", most: int, views: str) -> None:
     """Write the ``.nsvq`` file of at most ``most`` splats that is asked for."""
-    from nsvq_lightning.compression.compressor import Setting
-
-    if options.max_error is not None:
-        candidate = compressor.smallest_within(options.max_error, most)
-    elif options.target_bytes is not None:
-        candidate = compressor.finest_within(options.target_bytes, most)
-    else:
-        candidate = compressor.at(Setting(most, options.codebooks or DEFAULT_SIZE))
+    candidate = compressor.best(most, options.codebooks, options.target_bytes, options.max_error)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(options.output, candidate.data)
     before, after = options.input.stat().st_size, len(candidate.data)

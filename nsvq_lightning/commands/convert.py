@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import add_root, cameras_of, trained_scene, views_of
-from nsvq_lightning.commands.compress import VIEWS, share_or_number, splats_left, written_error
+from nsvq_lightning.commands.compress import share_or_number, splats_left, written_error
 from nsvq_lightning.io import formats, lod, placing, spz
 from nsvq_lightning.io.compressed import CompressedScene, attribute_errors
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
@@ -99,12 +99,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 # Formats that have an option of the writer; the first is named where another one is given.
-WRITER_OPTIONS = {
-    "level": (".nsvq",),
-    "palette": (".sog", lod.NAME),
-    "spz_version": (".spz",),
-    "spz_axes": (".spz",),
-}
+WRITER_OPTIONS = {"level": (".nsvq",), "palette": (".sog", lod.NAME), "spz_version": (".spz",), "spz_axes": (".spz",)}
 
 
 def _contradiction(options: argparse.Namespace) -> str:
@@ -201,6 +196,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
 
 def _thinned(scene: CompressedScene, count: int, options: argparse.Namespace) -> CompressedScene:
     """The splats that contribute most to photos of --data.root, or to the scene's own pictures."""
+    from nsvq_lightning.compression.viewpoints import VIEWS
     from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.training.importance import contributions, most_contributing, row_weights
 

@@ -125,10 +125,7 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     command = import_module(f"{__package__}.{name}")
     about, _, more = inspect.cleandoc(command.__doc__ or "").partition("\n\n")
     parser = Parser(
-        prog=f"nsvq {name}",
-        description=about,
-        epilog=more,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        prog=f"nsvq {name}", description=about, epilog=more, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     command.add_arguments(parser)
     options, further = parser.parse_known_args(arguments)

@@ -87,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
     is_video = output.suffix.lower() == VIDEO
     if output.suffix and not is_video:
         raise ValueError(f"{output}: name a video ({VIDEO}), or a folder for PNGs")
-    scene = trained_scene(file, options.root, options.scene)
+    scene = trained_scene(file, options.root)
     splats = scene.decode()
     cameras, fps = _path(options, splats, is_video)
     device = best_device()

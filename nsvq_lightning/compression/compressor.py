@@ -3,28 +3,47 @@
 import logging
 import math
 import timeit
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from nsvq_lightning.callbacks import LearningRateDecay, PhaseSchedule, SplatBudget, standard
 from nsvq_lightning.compression.basis import components
-from nsvq_lightning.compression.viewpoints import MEASURED, OWN, Measure
+from nsvq_lightning.compression.viewpoints import (
+    MEASURED,
+    OWN,
+    VIEWS,
+    Measure,
+    check_cameras,
+    likely_cameras,
+    own_scene,
+)
 from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.datamodule import SceneDataModule
+from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import decode, encode
 from nsvq_lightning.io.nsvq.header import frame, unframe
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.random import generator
+from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.rendering.sampling import trained_by
 from nsvq_lightning.report.numbers import evaluate
-from nsvq_lightning.splats.attributes import ATTRIBUTES, SIZES, attribute_dims, codebook_bits, codebook_sizes
-from nsvq_lightning.splats.splats import Splats, detached
+from nsvq_lightning.splats.attributes import (
+    ATTRIBUTES,
+    DEFAULT_SIZE,
+    SIZES,
+    attribute_dims,
+    codebook_bits,
+    codebook_sizes,
+)
+from nsvq_lightning.splats.splats import Splats, SplatTensors, detached
 from nsvq_lightning.training import importance
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
@@ -101,8 +120,6 @@ class Candidate:
 
 # Shares of the trained splats that are stored: those that are missed least go where a file is too large.
 KEPT = (1.0, 0.97)
-# Of views in which contributions are measured.
-MAX_VIEWS = 96
 # A file may be smaller by this share than it is to be.
 SLACK = 0.01
 # How many estimates of what to store in a file are tried.
@@ -145,7 +162,7 @@ class Compressor:
     scene: CompressedScene
     data: SceneDataModule
     measure: Measure
-    storage: Storage
+    storage: Storage = field(default_factory=Storage)
     seed: int = 0
     minutes: float = math.inf
     steps: int | None = None
@@ -156,11 +173,35 @@ class Compressor:
         self._render = partial(render, antialiased=self.scene.antialiased)
         views = self.data.scene
         self._is_own = views.split == OWN
-        self._views = {index: views.cameras[index] for index in views.some_train(MAX_VIEWS)}
+        self._views = {index: views.cameras[index] for index in views.some_train(VIEWS)}
         # Of settings without steps and shares, which need no training of their own.
         self._trained = cache(self._train)
         self._weights = cache(self._row_weights)
         self._effects = cache(self._likely_effects)
+
+    @classmethod
+    def from_views(
+        cls, scene: CompressedScene, cameras: Sequence[Camera], photos: Scene | None, seed: int = 0, **settings: Any
+    ) -> "Compressor":
+        """One that trains on photos, or without these on the scene's own pictures, and measures what cameras see."""
+        splats = scene.decode()
+        measure = Measure(splats, cameras, scene.antialiased)
+        data = SceneDataModule(photos or own_scene(splats, cameras, scene.antialiased), seed)
+        return cls(scene, data, measure, seed=seed, **settings)
+
+    def best(
+        self, splats: int, codebooks: str | None = None, target_bytes: int | None = None, max_error: float | None = None
+    ) -> Candidate:
+        """The smallest file with an error, the best one of a size, or that with these codebooks; the first asked for.
+
+        Raises:
+            ValueError: The limit cannot be met.
+        """
+        if max_error is not None:
+            return self.smallest_within(max_error, splats)
+        if target_bytes is not None:
+            return self.finest_within(target_bytes, splats)
+        return self.at(Setting(splats, codebooks or DEFAULT_SIZE))
 
     def at(self, setting: Setting) -> Candidate:
         """The scene at a setting."""
@@ -222,9 +263,7 @@ class Compressor:
     def _fitting(self, setting: Setting, target: int) -> Candidate | None:
         """The candidate nearest to the most exact one of at most ``target`` bytes."""
         return self._between(
-            setting,
-            lambda each: len(each.data) <= target,
-            is_close=lambda size: size >= (1 - SLACK) * target,
+            setting, lambda each: len(each.data) <= target, is_close=lambda size: size >= (1 - SLACK) * target
         )
 
     def _finest_coded(self, target: int, splats: int, needed: bool) -> Candidate | None:
@@ -384,3 +423,55 @@ class Compressor:
 
         seconds = 2 * min(timeit.repeat(step, number=1, repeat=3))
         return int(min(60 * self.minutes / seconds, 1e9))
+
+
+# What nerfstudio calls the coefficients of colours.
+NERFSTUDIO = {"features_dc": "sh0", "features_rest": "shN"}
+
+
+def compress(
+    splats: CompressedScene | SplatTensors | Mapping[str, Tensor],
+    cameras: Sequence[Camera] = (),
+    photos: Sequence[Tensor] = (),
+    *,
+    target_bytes: int | None = None,
+    max_error: float | None = None,
+    codebooks: str = DEFAULT_SIZE,
+    left: int | None = None,
+    antialiased: bool = False,
+    **settings: Any,
+) -> CompressedScene:
+    """A scene that was trained elsewhere, made small as ``nsvq compress`` does; :func:`nsvq_lightning.save` writes it.
+
+    Args:
+        splats: Raw attributes, such as those of gsplat or nerfstudio by name: ``means [N, 3]``, ``quats [N, 4]`` wxyz,
+            log-``scales [N, 3]``, logits ``opacities [N]``, ``sh0 [N, 1, 3]`` and ``shN [N, K, 3]``.
+        cameras: Those that the scene was trained by; without any, they are guessed.
+        photos: Of each camera ``[H, W, 3]`` RGB, uint8, or float in [0, 1]; without any, splats and codebooks are
+            fitted to what the cameras see of the scene itself.
+        target_bytes: Most bytes of a ``.nsvq`` file.
+        max_error: Instead, largest root mean square difference of pictures, for channels in [0, 1].
+        codebooks: Instead, the paper's name of their sizes, or ``"none"``.
+        left: How many splats are left; None leaves all.
+        antialiased: Whether the splats are rendered with anti-aliasing.
+        settings: ``seed``, ``minutes`` and ``steps`` of :class:`Compressor`.
+
+    Raises:
+        ValueError: The splats are empty or not finite, cameras do not show them, photos do not fit the cameras, or a
+            limit cannot be met.
+    """
+    if isinstance(splats, CompressedScene):
+        scene = splats
+    else:
+        named = splats if isinstance(splats, Mapping) else detached(splats)._asdict()
+        rows = {NERFSTUDIO.get(name, name): tensor.detach().cpu().numpy() for name, tensor in named.items()}
+        scene = CompressedScene.from_rows(rows, antialiased)
+    scene = scene.finite()
+    if cameras:
+        check_cameras(cameras, scene.means)
+        scene = replace(scene, cameras=trained_by(cameras))
+    splats = scene.decode()
+    views = own_scene(splats, cameras, scene.antialiased, photos) if photos else None
+    seen_from = cameras or likely_cameras(splats, VIEWS, 640, 640, degrees=50)
+    compressor = Compressor.from_views(scene, seen_from, views, **settings)
+    return compressor.best(min(left or len(scene), len(scene)), codebooks, target_bytes, max_error).scene

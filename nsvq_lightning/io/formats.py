@@ -73,12 +73,7 @@ def read_scene(path: StrPath) -> CompressedScene:
     return replace(kept, stored_bytes=scene.stored_bytes or path.stat().st_size)
 
 
-def save(
-    scene: "SplatTensors | CompressedScene",
-    path: StrPath,
-    storage: Storage | None = None,
-    **options: Any,
-) -> int:
+def save(scene: "SplatTensors | CompressedScene", path: StrPath, storage: Storage | None = None, **options: Any) -> int:
     """Save a scene in any supported format; splats with NaN or infinite values are left out with a warning.
 
     Args:
@@ -176,16 +171,10 @@ FORMATS: dict[str, Format] = {
     ".glb": Format("glTF, KHR_gaussian_splatting", glb.read_glb, glb.write_glb),
     ".usda": Format("OpenUSD, for scenes of moderate size", usda.read_usda, usda.write_usda),
     ".compressed.ply": Format(
-        "PlayCanvas, SuperSplat",
-        ply.read_ply,
-        ply.write_compressed_ply,
-        in_order=CompressedScene.in_morton_order,
+        "PlayCanvas, SuperSplat", ply.read_ply, ply.write_compressed_ply, in_order=CompressedScene.in_morton_order
     ),
     lod.NAME: Format(
-        "streamed SOG, a folder with levels of detail",
-        lod.read_lod,
-        lod.write_lod,
-        in_order=lod.in_lod_order,
+        "streamed SOG, a folder with levels of detail", lod.read_lod, lod.write_lod, in_order=lod.in_lod_order
     ),
     sog.META: Format("SOG as a folder", sog.read_sog, None),
     ".splat": Format(

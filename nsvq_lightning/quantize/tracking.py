@@ -34,9 +34,7 @@ def _list_squared(dim, x, at, codebook, lists, start, keep):
     def member(k):
         return squares(dim, x, at, codebook, np.int64(simd.get(lists, start + k)) * dim, keep)
 
-    return simd.lane_sums(
-        (member(0), member(1), member(2), member(3), member(4), member(5), member(6), member(7)),
-    )
+    return simd.lane_sums((member(0), member(1), member(2), member(3), member(4), member(5), member(6), member(7)))
 
 
 @inline

@@ -33,10 +33,7 @@ SMALLER = {"psnr_half": 2, "psnr_quarter": 4}
 
 @torch.no_grad()
 def evaluate(
-    render: Renderer,
-    splats: SplatTensors,
-    views: Iterable[View],
-    show: Callable[[Tensor, Tensor], None] | None = None,
+    render: Renderer, splats: SplatTensors, views: Iterable[View], show: Callable[[Tensor, Tensor], None] | None = None
 ) -> tuple[float, float]:
     """Mean PSNR, dB, and SSIM of rendered views against their photos, over the views of all processes.
 

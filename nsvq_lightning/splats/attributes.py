@@ -52,6 +52,9 @@ ATTRIBUTES = {
 # Codes of scales and rotations by the paper's names of codebook sizes, from the largest.
 SIZES = {"16k": 16384, "8k": 8192, "4k": 4096, "2k": 2048, "1k": 1024, "0.5k": 512}
 
+# What a trained scene is compressed with.
+DEFAULT_SIZE = "16k"
+
 # Attributes that may have a codebook, in file order; positions and opacities never have (paper, section 3).
 QUANTIZABLE = tuple(name for name, attribute in ATTRIBUTES.items() if attribute.code_share)
 

@@ -180,9 +180,11 @@ def test_cameras_of_another_scene_are_not_used(
         save(splats, path)
         assert len(trained_scene(path, None).cameras) == count
         assert len(cameras_of(path, None, splats.means.numpy())) == count
-    assert "of its splats and are not used: they are of another scene, or in other coordinates" in caplog.text
+    assert "scene.ply: the cameras beside it are not used: 9 cameras show " in caplog.text
     for wrong in (root, demo_scene):
-        with pytest.raises(ValueError, match=r"its 9 cameras show \d+% of the splats of .*: they are of another scene"):
+        with pytest.raises(
+            ValueError, match=r"scene.ply do not belong together: 9 cameras show \d+% of .*: they are of another"
+        ):
             views_of(path, moved, 4, wrong)
 
 
