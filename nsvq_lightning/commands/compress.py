@@ -109,23 +109,12 @@ def run(options: argparse.Namespace) -> int:
         raise argparse.ArgumentError(None, wrong)
     scene = trained_scene(options.input, options.root)
     most = splats_left(options.splats, len(scene))
-    from nsvq_lightning.compression.compressor import ON_BASIS, Compressor, setting_for
+    from nsvq_lightning.compression.compressor import Compressor
     from nsvq_lightning.compression.viewpoints import VIEWS
 
-    # What is impossible is said before the scene is looked at.
-    if options.target_bytes is not None and 8 * options.target_bytes < ON_BASIS * most:
-        setting_for(options.target_bytes, most, scene.sh_degree)
-    splats = scene.decode()
-    cameras, photos = views_of(options.input, splats, VIEWS, options.root)
-    compressor = Compressor.from_views(
-        scene,
-        cameras,
-        photos,
-        storage=Storage(options.level),
-        seed=options.seed,
-        minutes=options.minutes,
-        steps=options.steps,
-    )
+    cameras, photos = views_of(options.input, scene.decode(), VIEWS, options.root)
+    storage = Storage(options.level)
+    compressor = Compressor(scene, cameras, photos, storage, options.seed, options.minutes, options.steps)
     if streamed:
         _write_levels(options, compressor, most)
     else:

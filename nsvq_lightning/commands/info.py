@@ -21,16 +21,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Print the description of one file, without importing torch."""
     description = describe(options.file)
-    description["beside"] = _cameras_beside(options.file)
     say(json.dumps(description, indent=2, ensure_ascii=False) if options.json else _text(description))
     return 0
 
 
-def _cameras_beside(file: Path) -> str | None:
-    """What may have the cameras of a scene file: of INRIA's trainer, of COLMAP or of nerfstudio."""
-    names = "cameras.json", "sparse", "transforms.json", "transforms_train.json"
-    places = (folder / name for folder in folders_beside(file) for name in names)
-    return next((str(place) for place in places if place.exists()), None)
+# What may have the cameras of a scene file: of INRIA's trainer, of COLMAP or of nerfstudio.
+CAMERA_FILES = ("cameras.json", "sparse", "transforms.json", "transforms_train.json")
 
 
 def _text(facts: dict[str, Any]) -> str:
@@ -47,8 +43,9 @@ def _text(facts: dict[str, Any]) -> str:
         rows.append(("origin", ", ".join(map(repr, facts["origin"]))))
     if facts.get("cameras"):
         rows.append(("cameras", f"{facts['cameras']} of training"))
-    elif facts["beside"]:
-        rows.append(("cameras", f"not in the file, but maybe in {facts['beside']}"))
+    else:
+        places = (folder / name for folder in folders_beside(Path(facts["file"])) for name in CAMERA_FILES)
+        rows += [("cameras", f"not in the file, but maybe in {place}") for place in places if place.exists()][:1]
     parts = ["\n".join(f"{name:<11} {value}" for name, value in rows)]
     if "attributes" in facts:
         entries = map(itemgetter("name", "storage", "dim", "codes", "bits"), facts["attributes"])

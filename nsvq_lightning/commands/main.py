@@ -124,9 +124,8 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     """
     command = import_module(f"{__package__}.{name}")
     about, _, more = inspect.cleandoc(command.__doc__ or "").partition("\n\n")
-    parser = Parser(
-        prog=f"nsvq {name}", description=about, epilog=more, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    as_written = argparse.RawDescriptionHelpFormatter
+    parser = Parser(prog=f"nsvq {name}", description=about, epilog=more, formatter_class=as_written)
     command.add_arguments(parser)
     options, further = parser.parse_known_args(arguments)
     if further:

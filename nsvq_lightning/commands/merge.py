@@ -6,19 +6,13 @@ Examples:
 
 import argparse
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from statistics import fmean
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.split import RUN
-
-if TYPE_CHECKING:
-    from nsvq_lightning.data.blocks import Block
-    from nsvq_lightning.data.scene import Scene
-    from nsvq_lightning.io.compressed import CompressedScene
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,6 +32,8 @@ def run(options: argparse.Namespace) -> int:
     from nsvq_lightning.data.scene import load_scene
     from nsvq_lightning.io.compressed import CompressedScene
     from nsvq_lightning.io.formats import format_of, read_scene, save
+    from nsvq_lightning.rendering.rasterize import render
+    from nsvq_lightning.report.numbers import evaluate
 
     format_of(options.output)
     folders = [path.parent for path in options.parts.glob(f"*/{BLOCK}")]
@@ -61,34 +57,7 @@ def run(options: argparse.Namespace) -> int:
     scene = replace(CompressedScene.joined(parts), origin=photos.frame.origin)
     size = save(scene, options.output)
     say(f"{options.output}: {len(scene):,} splats in {size:,} bytes")
-    say(f"  test photos of {photos.root}: {_scores(scene, photos, blocks)}")
+    look = partial(render, antialiased=scene.antialiased)
+    quality, _ = evaluate(look, scene.decode(), map(photos.view, photos.test))
+    say(f"  test photos of {photos.root}: {quality:.2f} dB")
     return 0
-
-
-def _scores(scene: "CompressedScene", photos: "Scene", blocks: "list[Block]") -> str:
-    """Mean PSNR of the test photos; where seams between parts are seen, also that of the pixels near them."""
-    import torch
-
-    from nsvq_lightning.data.blocks import near_seams, points_in_front, shown
-    from nsvq_lightning.quality.metrics import eight_bit, psnr
-    from nsvq_lightning.rendering.rasterize import render
-
-    splats = scene.decode()
-    points = photos.points.double().numpy()
-    seams = near_seams(points, blocks)
-    everywhere: list[float] = []
-    at_seams: list[float] = []
-    elsewhere: list[float] = []
-    for index in photos.test:
-        view = photos.view(index)
-        with torch.no_grad():
-            image = render(splats, view.camera, antialiased=scene.antialiased).image
-        seam = torch.from_numpy(shown(points_in_front(points, view.camera), seams, view.camera))
-        counted = torch.ones_like(seam) if view.mask is None else view.mask
-        for scores, mask in ((everywhere, counted), (at_seams, counted & seam), (elsewhere, counted & ~seam)):
-            if mask.any():
-                scores.append(float(psnr(eight_bit(image), eight_bit(view.image), mask)))
-    text = f"{fmean(everywhere):.2f} dB"
-    if at_seams and elsewhere:
-        text += f"; at seams {fmean(at_seams):.2f} dB, elsewhere {fmean(elsewhere):.2f} dB"
-    return text

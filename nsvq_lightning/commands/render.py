@@ -124,7 +124,7 @@ def _path(options: argparse.Namespace, splats: "Splats", is_video: bool) -> "tup
     elif not cameras:
         if kind != "orbit":
             raise ValueError(
-                f"--path {kind} needs the cameras of photos: name their folder with --data.root, or take orbit"
+                f"--path {kind} needs the cameras of photos: name their folder (--data.root), or take orbit"
             )
         log.info("no photos: their cameras are guessed from the scene; --data.root names the folder of the photos")
         cameras = likely_cameras(splats, 24)

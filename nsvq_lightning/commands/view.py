@@ -57,9 +57,7 @@ def run(options: argparse.Namespace) -> int:
     from nsvq_lightning.report.viewer import LIVE_SCENE, viewer_page, write_viewer
 
     if options.live and (options.output is not None or not options.scene.is_dir()):
-        raise argparse.ArgumentError(
-            None, "--live follows a fit that is running: give the folder of the run, and no --output"
-        )
+        raise argparse.ArgumentError(None, "--live follows a running fit: give the folder of the run, and no --output")
     path = options.scene.resolve()
     title = f"{path.parent.name} / {path.name}" if path.is_dir() else path.name
     with _nsvq_file(options) as file:

@@ -2,7 +2,6 @@
 
 import logging
 import math
-import timeit
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
@@ -11,7 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nsvq_lightning.callbacks import LearningRateDecay, PhaseSchedule, SplatBudget, standard
+from nsvq_lightning import callbacks as cb
+from nsvq_lightning.callbacks.forecast import iteration_seconds
 from nsvq_lightning.compression.basis import components
 from nsvq_lightning.compression.viewpoints import (
     MEASURED,
@@ -30,7 +30,6 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.file import decode, encode
 from nsvq_lightning.io.nsvq.header import frame, unframe
 from nsvq_lightning.io.nsvq.precision import Storage
-from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.rendering.sampling import trained_by
@@ -50,9 +49,6 @@ from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.training.trainer import SplatTrainer
 
-# Steps of spherical harmonics on a basis.
-STEPS = (0.2, 1.6)
-
 
 @dataclass(frozen=True)
 class Setting:
@@ -61,17 +57,26 @@ class Setting:
     Attributes:
         splats: How many are left.
         codebooks: The paper's name of their sizes, or "none".
-        step: Of spherical harmonics on a basis (:func:`nsvq_lightning.compression.basis.components`), without
-            codebooks; 0 stores them as the others.
-        kept: Share of these that are stored.
+        on_basis: Whether, without codebooks, spherical harmonics are on a basis
+            (:func:`nsvq_lightning.compression.basis.components`).
+        turn: From the most exact file, 0, to the smallest one, 1, of the same splats.
         more: Codes of spherical harmonics beyond those of the size.
     """
 
     splats: int
     codebooks: str
-    step: float = 0.0
-    kept: float = 1.0
+    on_basis: bool = False
+    turn: float = 0.0
     more: int = 0
+
+
+# Steps of spherical harmonics on a basis, in the most exact and in the smallest file.
+STEPS = (0.2, 1.6)
+# In the smallest file, what has no codebooks is so many times coarser: with codebooks positions and opacities, ...
+COARSER = 2.0
+# ... without any scales, rotations and colours: of equal slope with the steps on plain fox, where twice as coarse saves
+# 10 bits a splat for 0.012 dB.
+COARSER_ROWS = 4.0
 
 
 # Bits a splat from which on a file without any codebooks may be better, and spherical harmonics are then on a basis.
@@ -118,8 +123,6 @@ class Candidate:
         return decode(*unframe(self.data))
 
 
-# Shares of the trained splats that are stored: those that are missed least go where a file is too large.
-KEPT = (1.0, 0.97)
 # A file may be smaller by this share than it is to be.
 SLACK = 0.01
 # How many estimates of what to store in a file are tried.
@@ -132,15 +135,6 @@ THINNED = 0.97
 THINNING = 3
 
 
-def _turned(setting: Setting, turn: float) -> Setting:
-    """The setting with its step, or else its share of splats, from the most exact at 0 to the smallest at 1."""
-    if setting.step:
-        exact, small = STEPS
-        return replace(setting, step=exact * (small / exact) ** turn)
-    exact, small = KEPT
-    return replace(setting, kept=exact * (small / exact) ** turn)
-
-
 @dataclass(eq=False)
 class Compressor:
     """Compresses one scene at any setting; each pair of codebooks and number of splats is trained at most once.
@@ -149,19 +143,20 @@ class Compressor:
 
     Attributes:
         scene: The scene, finite.
-        data: Views to train on.
-        measure: Measures errors.
+        cameras: Views in which errors are measured.
+        photos: Views to train on; by default, what the cameras see of the scene itself.
         storage: Level and precision.
         seed: Seed of all draws.
         minutes: What one training may take, about.
         steps: Steps of a training, at least 4; None as many as the minutes allow, at most :data:`USUAL_STEPS`, or
             :data:`THINNING` times as many.
+        measure: Measures errors.
         stopped: Whether Ctrl-C has ended a training before its end.
     """
 
     scene: CompressedScene
-    data: SceneDataModule
-    measure: Measure
+    cameras: Sequence[Camera]
+    photos: Scene | None = None
     storage: Storage = field(default_factory=Storage)
     seed: int = 0
     minutes: float = math.inf
@@ -170,24 +165,16 @@ class Compressor:
 
     def __post_init__(self) -> None:
         self._splats = detached(self.scene.decode())
-        self._render = partial(render, antialiased=self.scene.antialiased)
-        views = self.data.scene
+        antialiased = self.scene.antialiased
+        self._render = partial(render, antialiased=antialiased)
+        self.measure = Measure(self._splats, self.cameras, antialiased)
+        views = self.photos or own_scene(self._splats, self.cameras, antialiased)
+        self.data = SceneDataModule(views, self.seed)
         self._is_own = views.split == OWN
         self._views = {index: views.cameras[index] for index in views.some_train(VIEWS)}
-        # Of settings without steps and shares, which need no training of their own.
+        # Of settings that are not turned, which needs no training.
         self._trained = cache(self._train)
         self._weights = cache(self._row_weights)
-        self._effects = cache(self._likely_effects)
-
-    @classmethod
-    def from_views(
-        cls, scene: CompressedScene, cameras: Sequence[Camera], photos: Scene | None, seed: int = 0, **settings: Any
-    ) -> "Compressor":
-        """One that trains on photos, or without these on the scene's own pictures, and measures what cameras see."""
-        splats = scene.decode()
-        measure = Measure(splats, cameras, scene.antialiased)
-        data = SceneDataModule(photos or own_scene(splats, cameras, scene.antialiased), seed)
-        return cls(scene, data, measure, seed=seed, **settings)
 
     def best(
         self, splats: int, codebooks: str | None = None, target_bytes: int | None = None, max_error: float | None = None
@@ -205,30 +192,27 @@ class Compressor:
 
     def at(self, setting: Setting) -> Candidate:
         """The scene at a setting."""
-        whole = replace(setting, step=0.0, kept=1.0)
+        whole = replace(setting, on_basis=False, turn=0.0)
         scene = self._trained(whole)
-        if setting.step:
-            rows, basis = components(torch.from_numpy(scene.raw["shN"]), self._weights(whole), setting.step)
+        if setting.on_basis:
+            exact, small = STEPS
+            step = exact * (small / exact) ** setting.turn
+            rows, basis = components(torch.from_numpy(scene.raw["shN"]), self._weights(whole), step)
             scene = replace(scene, raw={**scene.raw, "shN": rows}, bases={"shN": basis})
-        if setting.kept < 1:
-            kept = importance.most_contributing(self._effects(whole), math.ceil(setting.kept * len(scene)))
-            scene = scene.take(kept.numpy()).in_use()
-        return Candidate(setting, b"".join(frame(*encode(scene, self.storage))))
+        times = (COARSER_ROWS if setting.codebooks == "none" else COARSER) ** setting.turn
+        names = [name for name in ("scales", "quats", "sh0") if name in scene.raw] or ["position", "opacity"]
+        precision = self.storage.precision
+        if times > 1:
+            coarser = {name: float(f"{times * getattr(precision, name):.3g}") for name in names}
+            precision = replace(precision, **coarser)
+            scene = replace(scene, config={**scene.config, "precision": coarser})
+        return Candidate(setting, b"".join(frame(*encode(scene, replace(self.storage, precision=precision)))))
 
     def _row_weights(self, setting: Setting) -> Tensor:
         """How much each splat counts where harmonics are put on a basis ``[N]``."""
         splats = self._trained(setting).decode()
         contribution = importance.contributions(splats, self._views.values(), self._render)
         return importance.row_weights(contribution).sqrt()
-
-    def _likely_effects(self, setting: Setting) -> Tensor:
-        """How much pictures are likely to change without each splat ``[N]``."""
-        splats = importance.below_cap(self._trained(setting).decode())
-        squares = torch.zeros_like(splats.opacities)
-        for index, camera in self._views.items():
-            signs = generator(self.seed, 0, "signs", index)
-            squares += importance.sensitivity(splats, camera, self._render, signs)[0].opacities
-        return importance.likely_effects(splats, squares)
 
     def error(self, candidate: Candidate) -> float:
         """Root mean square difference between its pictures and those of the original, for channels in [0, 1]."""
@@ -248,8 +232,8 @@ class Compressor:
         """
         found: list[Candidate | None] = []
         if 8 * target >= ON_BASIS * splats:
-            plain = Setting(splats, "none", STEPS[0] if self.scene.sh_degree else 0.0)
-            exact = self.at(replace(plain, step=0.0))
+            plain = Setting(splats, "none", self.scene.sh_degree > 0)
+            exact = self.at(replace(plain, on_basis=False))
             fits = exact if len(exact.data) <= target else self._fitting(plain, target)
             if fits and (self.stopped or (fits is exact and self._is_own)):
                 return fits
@@ -286,7 +270,7 @@ class Compressor:
                 break
             before = setting
             # What the estimate made of its bytes.
-            made = found or self.at(_turned(setting, 1.0))
+            made = found or self.at(replace(setting, turn=1.0))
             asked *= (1 - SLACK / 2) * target / len(made.data)
         return best
 
@@ -304,7 +288,7 @@ class Compressor:
         found = [plain] if fits(plain) else []
         settings = [Setting(splats, name) for name in SIZES]
         if self.scene.sh_degree:
-            settings.insert(0, Setting(splats, "none", STEPS[0]))
+            settings.insert(0, Setting(splats, "none", True))
         first, end = -1, len(settings)  # the last one with a file that fits, and the first one without
         while end - first > 1 and not self.stopped:
             middle = (first + end) // 2
@@ -330,15 +314,15 @@ class Compressor:
     ) -> Candidate | None:
         """The candidate nearest to the most exact one, or with ``small`` False to the smallest, that fits; or None."""
         good, bad = (1.0, 0.0) if small else (0.0, 1.0)
-        best = self.at(_turned(setting, bad))
+        best = self.at(replace(setting, turn=bad))
         if fits(best):
             return best
-        best = self.at(_turned(setting, good))
+        best = self.at(replace(setting, turn=good))
         if not fits(best):
             return None
         while abs(good - bad) > 0.02 and not is_close(len(best.data)):
             middle = (good + bad) / 2
-            candidate = self.at(_turned(setting, middle))
+            candidate = self.at(replace(setting, turn=middle))
             if fits(candidate):
                 best, good = candidate, middle
             else:
@@ -362,7 +346,7 @@ class Compressor:
             storage=self.storage,
         )
         if sizes or prune or not self._is_own:  # its own pictures teach nothing new
-            phases = PhaseSchedule(
+            phases = cb.PhaseSchedule(
                 total=steps,
                 reference_total=None,
                 min_finetune=1,
@@ -371,19 +355,10 @@ class Compressor:
                 quantize_end=prune + 2 * (steps - prune) // 3 if sizes else steps,
                 position_decay=max(1, prune),
             )
-            callbacks = standard(
-                phases=phases,
-                budget=SplatBudget(splats=setting.splats),
-                rate_decay=LearningRateDecay(start=prune),
-                density=None,
-                sh_degree=None,
-                codebook_replacement=None,
-                report=None,
-                live=None,
-                export=None,
-                predictions=None,
-                checkpoint=None,
-            )
+            budget = cb.SplatBudget(splats=setting.splats)
+            which = [budget, phases, cb.LearningRateDecay(start=prune), cb.SplatSelection(), cb.CanonicalCovariance()]
+            codes = [cb.CodebookInit(), cb.FiniteCodes(), cb.FreezeCodes()]
+            callbacks = [*which, *codes, cb.SplatProgressBar()]
             self._fit(module, SplatTrainer(max_steps=steps, callbacks=callbacks, enable_checkpointing=False))
         found = replace(module.compressed().finite(), origin=self.scene.origin, cameras=self.scene.cameras)
         del module
@@ -414,14 +389,7 @@ class Compressor:
     @cached_property
     def _affordable(self) -> int:
         """How many steps the minutes are enough for."""
-        device = best_device()
-        leaves = type(self._splats)(*(tensor.to(device).clone().requires_grad_() for tensor in self._splats))
-
-        def step() -> None:
-            self._render(leaves, self.measure.cameras[0]).image.sum().backward()  # type: ignore[no-untyped-call]
-            torch.get_device_module(device).synchronize()
-
-        seconds = 2 * min(timeit.repeat(step, number=1, repeat=3))
+        seconds = iteration_seconds(self.data.scene, [(1.0, len(self.scene))], best_device())
         return int(min(60 * self.minutes / seconds, 1e9))
 
 
@@ -473,5 +441,5 @@ def compress(
     splats = scene.decode()
     views = own_scene(splats, cameras, scene.antialiased, photos) if photos else None
     seen_from = cameras or likely_cameras(splats, VIEWS, 640, 640, degrees=50)
-    compressor = Compressor.from_views(scene, seen_from, views, **settings)
+    compressor = Compressor(scene, seen_from, views, **settings)
     return compressor.best(min(left or len(scene), len(scene)), codebooks, target_bytes, max_error).scene

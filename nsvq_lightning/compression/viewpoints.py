@@ -151,10 +151,8 @@ def check_cameras(cameras: Sequence[Camera], means: Float32s) -> None:
     places = means[:: -(-len(means) // SOME_SPLATS)]
     shown = share_shown(places.astype(np.float64), list(cameras[:: -(-len(cameras) // SOME_CAMERAS)]))
     if shown < MIN_SHOWN:
-        raise ValueError(
-            f"{len(cameras)} cameras show {shown:.0%} of the scene's splats: they are of another scene, or in other "
-            "coordinates (x right, y down, z forward in a camera)"
-        )
+        others = "they are of another scene, or in other coordinates (x right, y down, z forward)"
+        raise ValueError(f"{len(cameras)} cameras show {shown:.0%} of the scene's splats: {others}")
 
 
 def decibels(error: float) -> float:

@@ -165,15 +165,6 @@ def _quantiles(values: Float64s, weights: Float64s, shares: Sequence[float] | Fl
     return np.asarray(values[order][sums.searchsorted(np.array(shares) * sums[-1])])
 
 
-# What of the surroundings counts as at the seam.
-_SEAM = 0.3
-
-
-def near_seams(points: Float64s, blocks: Sequence[Block]) -> Bools:
-    """Which points ``[P, 3]`` lie where two parts meet."""
-    return np.asarray(sum(block.contains(points, _SEAM) for block in blocks) > 1)
-
-
 # A point in a file: its position, then its colour.
 _POINT = [(axis, "<f4") for axis in "xyz"] + [(color, "u1") for color in ("red", "green", "blue")]
 # A photo belongs to a part if it shows it in this share of its cells.

@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
+Factor = Literal[1, 2, 4, 8]
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -128,7 +130,6 @@ class Scene:
         return View(self.names[index], index, self.cameras[index], *self.images[index])
 
 
-Factor = Literal[1, 2, 4, 8]
 # Distance of the cameras from the origin, in extents, from which files have another: float32 would be too coarse.
 _FARTHEST = 100
 # A camera or a point so many times as far from the middle as four fifths of its kind has gone astray.

@@ -147,9 +147,7 @@ class CompressedScene:
         if len(scenes) == 1:
             return first
         if len({scene.antialiased for scene in scenes}) > 1:
-            raise ValueError(
-                "some of the scenes were trained with anti-aliasing and some were not; they cannot be joined"
-            )
+            raise ValueError("some scenes were trained with anti-aliasing and some were not; they cannot be joined")
         degree = max(scene.sh_degree for scene in scenes)
         scenes = [scene.with_degree(degree) for scene in scenes]
         codes, codebooks, raw = {}, {}, {}

@@ -70,9 +70,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
         and size > 0
         and np.allclose(linear @ linear.T, size**2 * np.eye(3), 0, 1e-5 * size**2)
     ):
-        raise ValueError(
-            f"{linear.tolist()} is no rotation times a number: splats can be turned and scaled evenly only"
-        )
+        raise ValueError(f"{linear.tolist()} is no scaled rotation: splats can be turned and scaled evenly only")
     rotation = linear / size
     harmonics = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
 

@@ -16,7 +16,7 @@ from nsvq_lightning.io.formats import read_scene, save
 
 @pytest.fixture(autouse=True)
 def few_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nsvq_lightning.commands.compress.VIEWS", 4)
+    monkeypatch.setattr("nsvq_lightning.compression.viewpoints.VIEWS", 4)
 
 
 def test_a_file_is_compressed_and_again_to_the_same_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

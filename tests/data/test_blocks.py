@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nsvq_lightning.data.blocks import Block, cut, near_seams, points_in_front, shown, write_blocks
+from nsvq_lightning.data.blocks import Block, cut, points_in_front, shown, write_blocks
 from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.scene import Scene, load_scene
 from nsvq_lightning.rendering.camera import Camera
@@ -78,7 +78,6 @@ def test_a_part_is_a_scene_with_the_same_cameras_and_split(scene: Scene, tmp_pat
             assert view.mask.any(1)[[0, -1]].all()
             assert view.mask.any(0)[[0, -1]].all()
             assert torch.equal(view.image[view.mask], crop[view.mask])
-    assert near_seams(scene.points.double().numpy(), blocks).any()
 
 
 def test_too_many_parts_are_refused(scene: Scene) -> None:

@@ -72,23 +72,12 @@ def run(options: argparse.Namespace) -> int:
     if steps is not None and steps < 4:
         raise argparse.ArgumentError(None, f"--steps must be at least 4, one for each phase, got {steps}")
     if options.init_from is not None and not (scene is not None and scene.is_dir()):
-        raise argparse.ArgumentError(
-            None, "--init-from needs a COLMAP folder as --scene, whose cameras look at its splats"
-        )
+        raise argparse.ArgumentError(None, "--init-from needs a COLMAP folder as --scene, whose cameras see its splats")
     from nsvq_lightning.commands.benchmark.timing import Scope, as_markdown, describe_machine
-    from nsvq_lightning.data.scene import load_scene
-    from nsvq_lightning.io.formats import read_scene
 
     given = {name: value for name, value in vars(options).items() if name != "suites" and value is not None}
     scope = Scope(**{**(QUICK if options.quick else {}), **given})
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
-    # Before anything is measured: a wrong file must end in one line.
-    file = scene
-    if scope.photos is not None:
-        load_scene(scope.photos)
-        file = options.init_from
-    if file is not None:
-        read_scene(file)
     about = describe_machine()  # as busy as the machine is before
     found = {}
     for name in options.suites:

@@ -42,7 +42,7 @@ def write_nsvq(path: StrPath, scene: CompressedScene, storage: Storage | None = 
     Args:
         path: File to write.
         scene: The scene; :func:`nsvq_lightning.save` leaves out non-finite splats, which level ``compact`` refuses.
-        storage: Level and precision.
+        storage: Level and precision; by default those of the file that it was read from, where these are others.
 
     Returns:
         Bytes of the file.
@@ -50,7 +50,7 @@ def write_nsvq(path: StrPath, scene: CompressedScene, storage: Storage | None = 
     Raises:
         ValueError: ``config`` is not made of JSON values, or level ``compact`` cannot store a value.
     """
-    storage = storage or Storage()
+    storage = storage or Storage.told(scene.config)
     if storage.level == "compact" and (culprits := scene.finite_rows()[1]):
         raise ValueError(
             f"numbers that are not finite ({listed(culprits)}): drop those splats, or use level 'paper', which stores "

@@ -86,6 +86,14 @@ class Storage:
             raise ValueError(f"unknown compression level {self.level!r}; there are {', '.join(LEVELS)}")
 
     @classmethod
+    def told(cls, config: Mapping[str, Any]) -> "Storage":
+        """What the ``config`` of a scene says of the precision that it was stored with; else the default."""
+        try:
+            return cls(precision=Precision(**config["precision"]))
+        except (KeyError, TypeError, ValueError):
+            return cls()
+
+    @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Storage":
         """The settings from plain data, as stored in a checkpoint."""
         return cls(values["level"], Precision(**values["precision"]))
