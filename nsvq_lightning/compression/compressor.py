@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import ParameterDict
 
 from nsvq_lightning import callbacks as cb
 from nsvq_lightning.callbacks.forecast import iteration_seconds
@@ -398,7 +399,7 @@ NERFSTUDIO = {"features_dc": "sh0", "features_rest": "shN"}
 
 
 def compress(
-    splats: CompressedScene | SplatTensors | Mapping[str, Tensor],
+    splats: CompressedScene | SplatTensors | Mapping[str, Tensor] | ParameterDict,
     cameras: Sequence[Camera] = (),
     photos: Sequence[Tensor] = (),
     *,
@@ -431,7 +432,7 @@ def compress(
     if isinstance(splats, CompressedScene):
         scene = splats
     else:
-        named = splats if isinstance(splats, Mapping) else detached(splats)._asdict()
+        named = splats if isinstance(splats, Mapping | ParameterDict) else detached(splats)._asdict()
         rows = {NERFSTUDIO.get(name, name): tensor.detach().cpu().numpy() for name, tensor in named.items()}
         scene = CompressedScene.from_rows(rows, antialiased)
     scene = scene.finite()

@@ -165,7 +165,7 @@ def test_a_scene_of_another_program_is_compressed() -> None:
     scene = ball(300)
     splats = scene.decode()
     cameras = cameras_around(scene.means, 8, 80, 60)
-    gsplat = dict(splats.named_parameters())
+    gsplat = torch.nn.ParameterDict(dict(splats.named_parameters()))
     nerfstudio = {name: gsplat[name] for name in ("means", "quats", "scales")}
     nerfstudio["opacities"] = gsplat["opacities"][:, None]
     nerfstudio["features_dc"], nerfstudio["features_rest"] = gsplat["sh0"][:, 0], gsplat["shN"]
