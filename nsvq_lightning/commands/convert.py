@@ -58,10 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     help_ = "move the scene so that the cameras of --data.root are where those of this scene folder are, by photo name"
     turn("--align", type=Path, metavar="FOLDER", help=help_)
     add("--up-from", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where up is in the input, for --up")
-    add_root(
-        parser,
-        "scene folder: for --floaters, --up and --align; for --measure and --splats instead of the scene's pictures",
-    )
+    add_root(parser, "scene folder for --floaters, --up, --align; for --measure, --splats in place of its own pictures")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -2,12 +2,14 @@
 
 import logging
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from typing import Any
 
 import torch
+from lightning.pytorch import Callback
 from torch import Tensor
 from torch.nn import ParameterDict
 
@@ -128,6 +130,8 @@ class Candidate:
 SLACK = 0.01
 # How many estimates of what to store in a file are tried.
 ESTIMATES = 5
+# PSNR of a scene in photos, dB, below which these are not its own: six scenes have 19 or more, in photos of others 11.
+MIN_PSNR = 12.0
 # Steps of a training.
 MIN_STEPS = 20
 USUAL_STEPS = 500
@@ -172,6 +176,8 @@ class Compressor:
         views = self.photos or own_scene(self._splats, self.cameras, antialiased)
         self.data = SceneDataModule(views, self.seed)
         self._is_own = views.split == OWN
+        if not self._is_own and (likeness := self._psnr(self._splats)) < MIN_PSNR:
+            raise ValueError(f"photos of {views.root} are not of this scene: its pictures have {likeness:.1f} dB there")
         self._views = {index: views.cameras[index] for index in views.some_train(VIEWS)}
         # Of settings that are not turned, which needs no training.
         self._trained = cache(self._train)
@@ -221,9 +227,12 @@ class Compressor:
 
     def quality(self, candidate: Candidate) -> float:
         """PSNR of its pictures in views that it was not trained on, in dB: against their photos, if there are any."""
+        return self._psnr(candidate.scene.decode())
+
+    def _psnr(self, splats: SplatTensors) -> float:
         views = self.data.scene
         some = views.test[:: -(-len(views.test) // MEASURED)]
-        return evaluate(self._render, candidate.scene.decode(), map(views.view, some))[0]
+        return evaluate(self._render, splats, map(views.view, some))[0]
 
     def finest_within(self, target: int, splats: int) -> Candidate:
         """The best file of at most ``target`` bytes and this many splats: with or without codebooks, by its quality.
@@ -360,19 +369,21 @@ class Compressor:
             which = [budget, phases, cb.LearningRateDecay(start=prune), cb.SplatSelection(), cb.CanonicalCovariance()]
             codes = [cb.CodebookInit(), cb.FiniteCodes(), cb.FreezeCodes()]
             callbacks = [*which, *codes, cb.SplatProgressBar()]
-            self._fit(module, SplatTrainer(max_steps=steps, callbacks=callbacks, enable_checkpointing=False))
+            self._fit(module, steps, callbacks)
         found = replace(module.compressed().finite(), origin=self.scene.origin, cameras=self.scene.cameras)
         del module
         trim()
         return found
 
-    def _fit(self, module: SplatModule, trainer: SplatTrainer) -> None:
+    def _fit(self, module: SplatModule, steps: int, callbacks: list[Callback]) -> None:
         """Train without Lightning's messages; Ctrl-C ends it early once there are codes."""
-        chatter = logging.getLogger("lightning.pytorch")
+        chatter = logging.getLogger("lightning.pytorch.utilities.rank_zero")
         level = chatter.level
         chatter.setLevel(logging.WARNING)
         try:
-            trainer.fit(module, self.data)
+            with warnings.catch_warnings(action="ignore"):
+                trainer = SplatTrainer(max_steps=steps, callbacks=callbacks, enable_checkpointing=False)
+                trainer.fit(module, self.data)
         except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
             if module.phase < Phase.QUANTIZE:
                 raise
@@ -441,6 +452,5 @@ def compress(
         scene = replace(scene, cameras=trained_by(cameras))
     splats = scene.decode()
     views = own_scene(splats, cameras, scene.antialiased, photos) if photos else None
-    seen_from = cameras or likely_cameras(splats, VIEWS, 640, 640, degrees=50)
-    compressor = Compressor(scene, seen_from, views, **settings)
+    compressor = Compressor(scene, cameras or likely_cameras(splats, VIEWS, 640, 640, degrees=50), views, **settings)
     return compressor.best(min(left or len(scene), len(scene)), codebooks, target_bytes, max_error).scene

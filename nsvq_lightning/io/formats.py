@@ -56,9 +56,7 @@ def load(path: StrPath) -> "Splats":
     """
     scene = read_scene(path)
     if any(scene.origin):
-        logger.warning(
-            "%s: positions are relative to the world point %s; read_nsvq(path).origin has it", path, scene.origin
-        )
+        logger.warning("%s: positions are relative to %s in the world: read_nsvq(path).origin", path, scene.origin)
     return scene.decode()
 
 

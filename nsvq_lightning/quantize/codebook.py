@@ -300,9 +300,7 @@ class CodebookQuantizer(nn.Module, ABC):
 
     def _frozen_codes(self, count: int, rows: Tensor | None) -> Tensor:
         if count != self.codes.shape[0]:
-            raise ValueError(
-                f"codes are frozen for {len(self.codes)} rows, got {count}; pass all, and `rows` to choose"
-            )
+            raise ValueError(f"codes are frozen for {len(self.codes)} rows, got {count}; pass all; `rows` chooses")
         return self.codes if rows is None else self.codes[rows]
 
     def _resize(self, num_codes: int) -> None:

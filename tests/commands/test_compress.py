@@ -10,8 +10,10 @@ import pytest
 from splat_scenes import ball
 
 from nsvq_lightning.commands.main import main
+from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import CompressedScene, read_header, read_nsvq, write_ply
 from nsvq_lightning.io.formats import read_scene, save
+from nsvq_lightning.splats.splats import Splats, detached
 
 
 @pytest.fixture(autouse=True)
@@ -56,12 +58,16 @@ def test_levels_of_detail_have_a_quarter_of_the_splats_each(tmp_path: Path, caps
 
 def test_photos_are_trained_on(tmp_path: Path, demo_scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, output = tmp_path / "scene.nsvq", tmp_path / "out.nsvq"
-    save(ball(400, degree=0), source)
-    assert (
-        main(["compress", str(source), str(output), "--codebooks=0.5k", "--steps=3", f"--data.root={demo_scene}"]) == 0
-    )
-    assert len(read_nsvq(output)) == 400
+    photos = load_scene(demo_scene)
+    splats = Splats.from_points(photos.points, photos.colors, opacity=0.9)
+    command = ["compress", str(source), str(output), "--codebooks=0.5k", "--steps=3", f"--data.root={demo_scene}"]
+    save(splats, source)
+    assert main(command) == 0
+    assert len(read_nsvq(output)) == len(photos.points)
     assert f"fitted to the photos of {demo_scene}" in capsys.readouterr().out
+    save(detached(splats)._replace(sh0=-4 * splats.sh0), source)
+    assert main(command) == 1
+    assert f"photos of {demo_scene} are not of this scene: its pictures have " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("aim", "value"), [("--target-bytes", "9000"), ("--max-error", "0.2")])
