@@ -197,7 +197,7 @@ def cameras_of(path: Path, root: Path | None, means: "Float32s | None" = None) -
 
     Raises:
         SceneError: The folder is not a scene.
-        ValueError: What the run has recorded is damaged, or the cameras of ``root`` do not show the scene.
+        ValueError: What the run has recorded is damaged.
     """
     from nsvq_lightning.compression.viewpoints import check_cameras
 
@@ -207,9 +207,7 @@ def cameras_of(path: Path, root: Path | None, means: "Float32s | None" = None) -
     try:
         check_cameras(list(cameras.values()), means)
     except ValueError as error:
-        if root is not None:
-            raise ValueError(f"{root} and {path} do not belong together: {error}") from None
-        log.warning("%s: the cameras beside it are not used: %s", path, error)
+        log.warning("%s: the cameras of %s are not used: %s", path, root or "the folders beside it", error)
         return {}
     return cameras
 

@@ -106,7 +106,9 @@ def splats_of_file(path: str, frame: Frame, sh_degree: int) -> Splats:
     """
     scene = read_scene(path).relative_to(frame.origin)
     if scene.sh_degree != sh_degree:
-        raise ValueError(f"{path} has SH degree {scene.sh_degree}, not the module's {sh_degree}; set sh_degree to that")
+        raise ValueError(
+            f"{path} has SH degree {scene.sh_degree}, the module {sh_degree}; set sh_degree={scene.sh_degree}"
+        )
     return Splats.from_tensors(*frame.splats(scene.decode()))
 
 
