@@ -150,7 +150,7 @@ def folders_beside(path: Path) -> list[Path]:
     return [run, *run.parents][:3]
 
 
-def _known_views(path: Path, root: Path | None) -> "tuple[dict[str, Camera], Scene | None]":
+def _found_views(path: Path, root: Path | None) -> "tuple[dict[str, Camera], Scene | None]":
     """Cameras by name of the photos that a scene was trained on, and these photos, if a folder of them is named.
 
     That is ``root``, or the one in the settings of the scene's run; photos of a run have the size that it has trained
@@ -199,17 +199,22 @@ def cameras_of(path: Path, root: Path | None, means: "Float32s | None" = None) -
         SceneError: The folder is not a scene.
         ValueError: What the run has recorded is damaged.
     """
+    return _known_views(path, root, means)[0]
+
+
+def _known_views(path: Path, root: Path | None, means: "Float32s | None") -> "tuple[dict[str, Camera], Scene | None]":
+    """What :func:`_found_views` has found, if it shows the scene."""
     from nsvq_lightning.compression.viewpoints import check_cameras
 
-    cameras, _ = _known_views(path, root)
+    cameras, photos = _found_views(path, root)
     if means is None or not cameras or not len(means):
-        return cameras
+        return cameras, photos
     try:
         check_cameras(list(cameras.values()), means)
     except ValueError as error:
         log.warning("%s: the cameras of %s are not used: %s", path, root or "the folders beside it", error)
-        return {}
-    return cameras
+        return {}, None
+    return cameras, photos
 
 
 def trained_scene(path: Path, root: Path | None) -> "CompressedScene":
@@ -257,11 +262,10 @@ def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -
     """
     from nsvq_lightning.compression.viewpoints import likely_cameras
 
-    known = list(cameras_of(path, root, splats.means.detach().cpu().numpy()).values())
-    if not known:
+    cameras, photos = _known_views(path, root, splats.means.detach().cpu().numpy())
+    if photos is not None:
+        return [photos.cameras[index] for index in photos.some_train(most)], photos
+    if not cameras:
         # A square picture with the pixels of a photo: what a wide one shows at its edges, photos seldom do.
         return likely_cameras(splats, most, 640, 640, degrees=50), None
-    _, photos = _known_views(path, root)
-    if photos is None:
-        return known[:: math.ceil(len(known) / most)], None
-    return [photos.cameras[index] for index in photos.some_train(most)], photos
+    return list(cameras.values())[:: math.ceil(len(cameras) / most)], None

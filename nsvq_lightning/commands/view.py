@@ -113,15 +113,17 @@ def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.io.formats import load
 
-    splats = None if options.live else load(file)
+    # What a run has recorded are its own, and need no look at the scene.
+    is_own = options.root is None and (options.scene / "viewer.html").is_file()
+    splats = None if options.live or is_own else load(file)
     cameras = cameras_of(options.scene, options.root, None if splats is None else splats.means.detach().numpy())
     if cameras:
         every = math.ceil(len(cameras) / MAX_CAMERAS)
         return dict(islice(cameras.items(), 0, None, every))
-    if splats is None:
+    if options.live:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
     sys.stderr.write("no photos: cameras are guessed from the scene; --data.root names the folder of the photos\n")
-    return {f"guess {index}": camera for index, camera in enumerate(likely_cameras(splats, 12), 1)}
+    return {f"guess {index}": camera for index, camera in enumerate(likely_cameras(splats or load(file), 12), 1)}
 
 
 class _Server(ThreadingHTTPServer):

@@ -80,8 +80,6 @@ COARSER = 2.0
 # ... without any scales, rotations and colours: of equal slope with the steps on plain fox, where twice as coarse saves
 # 10 bits a splat for 0.012 dB.
 COARSER_ROWS = 4.0
-
-
 # Bits a splat from which on a file without any codebooks may be better, and spherical harmonics are then on a basis.
 ON_BASIS = 90
 # Bits of a splat's position and opacity, about.
