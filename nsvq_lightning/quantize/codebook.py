@@ -62,6 +62,7 @@ class CodebookQuantizer(nn.Module, ABC):
             scales by a quarter and gained 0.2 dB of test PSNR right after k-means.
 
     Attributes:
+        max_codes: Codes that :meth:`fit` may place.
         codebook: Codes ``[K, D]`` in the raw space of the attribute, 0 until :meth:`fit`.
         usage: Iterations of the window in which each code was hit at least once, ``[K]`` int64.
         window: Iterations in the window, scalar int64.
@@ -91,6 +92,7 @@ class CodebookQuantizer(nn.Module, ABC):
             raise ValueError(f"start must be 'sample' or 'spread', got {start!r}")
         self.kmeans_steps = kmeans_steps
         self.start = start
+        self.max_codes = num_codes
         self._tracker = NearestTracker()
         self.codebook = nn.Parameter(torch.zeros(num_codes, dim))
         self.register_buffer("usage", torch.zeros(num_codes, dtype=torch.int64))
@@ -122,7 +124,7 @@ class CodebookQuantizer(nn.Module, ABC):
         return self.codes.numel() > 0
 
     def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
-        """Place the codebook on rows by k-means; K becomes at most the number of distinct rows.
+        """Place the codebook on rows by k-means; K becomes at most the number of distinct rows, whatever it was before.
 
         The parameter stays the same object, since an optimiser group refers to it; fit before its first optimiser step.
 
@@ -137,7 +139,7 @@ class CodebookQuantizer(nn.Module, ABC):
         if x.dim() != 2 or x.shape[1] != self.dim:
             raise ValueError(f"rows must have shape [N, {self.dim}], got {list(x.shape)}")
         spread = self.start == "spread"
-        centroids = kmeans(x, self.num_codes, generator or seeded(0), weight, self.kmeans_steps, spread=spread)
+        centroids = kmeans(x, self.max_codes, generator or seeded(0), weight, self.kmeans_steps, spread=spread)
         self._resize(centroids.shape[0])
         with torch.no_grad():
             self.codebook.copy_(centroids)
@@ -152,6 +154,7 @@ class CodebookQuantizer(nn.Module, ABC):
         """
         if codes < 1:
             raise ValueError(f"a codebook needs at least 1 code, got {codes}")
+        self.max_codes = min(codes, self.max_codes)
         self._resize(min(codes, self.num_codes))
 
     def forward(

@@ -60,30 +60,7 @@ class PostHoc(CodebookQuantizer):
     quantizer.
 
     Leave the fine-tune phase out (``phases.quantize_end`` at the end of the run): it would train the codebooks.
-
-    Args:
-        num_codes: Codes K, at least 1.
-        dim: Dimension D of a row.
-        **settings: Those of :class:`CodebookQuantizer`.
     """
-
-    def __init__(self, num_codes: int, dim: int, **settings: Any) -> None:
-        super().__init__(num_codes, dim, **settings)
-        self.max_codes = num_codes
-
-    def limit(self, codes: int) -> None:
-        """Have at most ``codes`` codes from the next :meth:`fit` on.
-
-        Raises:
-            ValueError: ``codes`` is below 1.
-        """
-        super().limit(codes)
-        self.max_codes = self.num_codes
-
-    def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
-        """Fit the codebook as :meth:`CodebookQuantizer.fit` does; K may grow again if earlier rows made it smaller."""
-        self._resize(self.max_codes)
-        super().fit(x, weight, generator)
 
     def forward(
         self, x: Tensor, generator: torch.Generator | None = None, rows: Tensor | None = None
