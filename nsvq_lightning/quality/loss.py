@@ -4,7 +4,8 @@ No loss and no metric depends on masked pixels. Both pictures are black there, a
 to be beyond their borders, and means are over the pixels that count.
 """
 
-from typing import Any, Literal
+from importlib import import_module
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -42,14 +43,9 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     if mask is not None:
         return 1 - mean_of_kept(1 - ssim(apply_mask(image, mask), apply_mask(target, mask)), mask)
     kernels = None if torch.is_grad_enabled() and image.requires_grad else _kernels(image, target)
-    if kernels == "cpu":
-        from nsvq_lightning.quality.ssim_cpu import l1_dssim
-
-        return image.new_tensor(1 - l1_dssim(image.contiguous(), target.contiguous(), 1.0)[0])
-    if kernels == "cuda":
-        from nsvq_lightning.quality.ssim_cuda import l1_dssim as l1_dssim_cuda
-
-        return 1 - l1_dssim_cuda(image.contiguous(), target.contiguous(), 1.0, derived=False)[0]
+    if kernels is not None:
+        loss: Tensor = kernels.l1_dssim(image.contiguous(), target.contiguous(), 1.0, derived=False)[0]
+        return (1 - loss).to(image)
     return plain_ssim(*in_range(image, target))
 
 
@@ -72,8 +68,7 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2, m
         return mean_of_kept(photometric_loss(apply_mask(image, mask), apply_mask(target, mask), dssim_weight), mask)
     kernels = _kernels(image, target)
     if kernels is not None:
-        function = _CpuLoss if kernels == "cpu" else _CudaLoss
-        loss: Tensor = function.apply(image, target, dssim_weight)  # type: ignore[no-untyped-call]
+        loss: Tensor = _Loss.apply(image, target, dssim_weight, kernels)  # type: ignore[no-untyped-call]
         return loss
     return plain_loss(image, target, dssim_weight)
 
@@ -84,45 +79,26 @@ def plain_loss(image: Tensor, target: Tensor, dssim_weight: float) -> Tensor:
     return (1 - dssim_weight) * (image - target).abs().mean() + dssim_weight * (1 - plain_ssim(image, target))
 
 
-def _kernels(image: Tensor, target: Tensor) -> Literal["cpu", "cuda"] | None:
-    """Which fused kernels can take the images; the CPU kernels need rows of at least one vector."""
+def _kernels(image: Tensor, target: Tensor) -> Any:
+    """The module of fused kernels that can take the images, or None; those of the CPU need rows of a vector or more."""
     kernels = kernels_for(image)
     fits = target.dtype in (torch.float32, torch.uint8) and not target.requires_grad and target.device == image.device
     wide = 3 * image.shape[1] >= 16 if kernels == "cpu" else image.numel() > 0
-    return kernels if fits and wide else None
+    return import_module(f"{__package__}.ssim_{kernels}") if kernels and fits and wide else None
 
 
-class _CpuLoss(torch.autograd.Function):
+class _Loss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, dssim_weight: float) -> Tensor:
-        from nsvq_lightning.quality.ssim_cpu import l1_dssim
-
-        loss, gradient = l1_dssim(image.detach().contiguous(), target.contiguous(), dssim_weight)
-        ctx.save_for_backward(gradient)
-        return image.new_tensor(loss)
-
-    @staticmethod
-    def backward(ctx: Any, scale: Tensor) -> tuple[Tensor, None, None]:
-        (gradient,) = ctx.saved_tensors
-        # With one view per step the scale is 1, and skipping a pass over the image pays.
-        return gradient if scale == 1 else gradient * scale, None, None
-
-
-class _CudaLoss(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, dssim_weight: float) -> Tensor:
-        from nsvq_lightning.quality.ssim_cuda import l1_dssim
-
+    def forward(ctx: Any, image: Tensor, target: Tensor, dssim_weight: float, kernels: Any) -> Tensor:
         image, target = image.contiguous(), target.contiguous()
-        loss, derivatives = l1_dssim(image, target, dssim_weight, derived=ctx.needs_input_grad[0])
-        ctx.dssim_weight = dssim_weight
+        loss, derivatives = kernels.l1_dssim(image, target, dssim_weight, derived=ctx.needs_input_grad[0])
+        ctx.dssim_weight, ctx.kernels = dssim_weight, kernels
         ctx.save_for_backward(image, target, derivatives)
-        return loss
+        return loss.to(image)  # type: ignore[no-any-return]  # of modules that are found by their name
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, scale: Tensor) -> tuple[Tensor, None, None]:
-        from nsvq_lightning.quality.ssim_cuda import l1_dssim_backward
-
+    def backward(ctx: Any, scale: Tensor) -> tuple[Tensor, None, None, None]:
         image, target, derivatives = ctx.saved_tensors
-        return l1_dssim_backward(image, target, ctx.dssim_weight, derivatives, scale), None, None
+        gradient = ctx.kernels.l1_dssim_backward(image, target, ctx.dssim_weight, derivatives, scale)
+        return gradient, None, None, None

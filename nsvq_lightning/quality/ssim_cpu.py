@@ -174,13 +174,14 @@ def sweep_image(
             )
 
 
-def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float) -> tuple[float, Tensor]:
-    """Loss and its gradient with respect to ``image``, which is clamped to [0, 1] first; W must be at least 6.
+def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float, *, derived: bool = True) -> tuple[Tensor, Tensor]:
+    """Loss, a float64 scalar, and its gradient by ``image``, which is clamped to [0, 1] first; W must be at least 6.
 
     Args:
         image: Contiguous float32 ``[H, W, 3]`` on the CPU.
         target: Contiguous ``[H, W, 3]``, float32 in [0, 1] or uint8.
         dssim_weight: Share of 1 - SSIM.
+        derived: As for :mod:`nsvq_lightning.quality.ssim_cuda`; here the gradient comes along in any case.
 
     Raises:
         ValueError: The shapes differ or are not ``[H, W, 3]``, W is below 6, or a picture is not contiguous.
@@ -214,4 +215,11 @@ def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float) -> tuple[float,
     )  # fmt: skip
     similarity, difference = sums[0::2].sum() / count, sums[1::2].sum() / count
     work.give_back()
-    return float((1 - dssim_weight) * difference + dssim_weight * (1 - similarity)), gradient
+    loss = (1 - dssim_weight) * difference + dssim_weight * (1 - similarity)
+    return torch.tensor(loss, dtype=torch.float64), gradient
+
+
+def l1_dssim_backward(image: Tensor, target: Tensor, dssim_weight: float, gradient: Tensor, scale: Tensor) -> Tensor:
+    """Gradient ``[H, W, 3]`` of ``scale`` times the loss by ``image``, from the one that :func:`l1_dssim` returned."""
+    # With one view per step the scale is 1, and skipping a pass over the image pays.
+    return gradient if scale == 1 else gradient * scale
