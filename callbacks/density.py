@@ -16,7 +16,7 @@ from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
-from nsvq_lightning.splats.splats import RawSplats, Splats, detached
+from nsvq_lightning.splats.splats import RawSplats, detached
 from nsvq_lightning.training import distributed, row_ops, run_scene
 from nsvq_lightning.training.importance import most_contributing
 from nsvq_lightning.training.module import SplatModule
@@ -117,18 +117,23 @@ class Densification(SplatCallback, ABC):
 
     def _observe(self, trainer: Trainer, module: SplatModule, outputs: dict[str, Any]) -> None:
         """Add a view (of each process) to the statistics, unless its loss is not finite or its splats have changed."""
-        render = _counted_render(outputs)
-        if render is not None and _has_changed(module.splats, render, outputs):
+        splats = module.splats
+        loss, render = outputs.get("late_loss"), outputs.get("render")
+        if loss is not None and not math.isfinite(loss.read()):
+            render = None
+        # As many as were rendered may be others.
+        edits = outputs.get("edits", splats.edits)
+        if render is not None and (len(render.radii) != len(splats) or edits != splats.edits):
             if not self._warned:
                 self._warned = True
                 log.warning(
                     f"iteration {trainer.global_step}: another callback has removed or added splats "
-                    f"({len(render.radii)} were rendered, now {len(module.splats)}) before density control took the "
+                    f"({len(render.radii)} were rendered, now {len(splats)}) before density control took the "
                     "statistics of the view; such views are left out from now on. List that callback after "
                     f"{type(self).__name__} to count all views"
                 )
             render = None
-        tables = [module.splats.add_table(name) for name in self.tables]
+        tables = [splats.add_table(name) for name in self.tables]
         several = trainer.world_size > 1
         own = [torch.zeros_like(table) for table in tables] if several else tables
         gradients = None if render is None else self.gradients(render)
@@ -284,19 +289,6 @@ class DensityControl(Densification):
         if huge:
             marked |= splats.scales.amax(1).exp() > self.huge_fraction * module.extent
         return self.prune(trainer, module, marked)
-
-
-def _counted_render(outputs: dict[str, Any]) -> Render | None:
-    """The step's rendering; None if there is none, or its loss is not finite."""
-    loss = outputs.get("late_loss")
-    if loss is not None and not math.isfinite(loss.read()):
-        return None
-    return outputs.get("render")
-
-
-def _has_changed(splats: Splats, render: Render, outputs: dict[str, Any]) -> bool:
-    """Whether splats were added or removed since they were rendered."""
-    return len(render.radii) != len(splats) or outputs.get("edits", splats.edits) != splats.edits
 
 
 @torch.no_grad()
