@@ -135,6 +135,8 @@ _FARTHEST = 100
 # A camera or a point so many times as far from the middle as four fifths of its kind has gone astray.
 _CAMERA_ASTRAY = 10
 _POINT_ASTRAY = 100
+# Distance from a camera's centre, in extents, within which a point is a failed triangulation, not a surface.
+_AT_CAMERA = 1e-6
 ONE_PLACE = "are taken from one place: without parallax there is no depth; move while taking photos"
 
 
@@ -229,7 +231,10 @@ def load_scene(
         poses = replace(poses, points=points, colors=np.full_like(points, 128, np.uint8))
     centres = np.stack([image.centre for image in poses.images])
     extent = EXTENT * frame.unit if np.ptp(centres, axis=0).any() else 0.0
-    usable = _away_from(centres, poses.points, _AT_CAMERA * extent) & ~astray(poses.points, _POINT_ASTRAY)
+    usable = ~astray(poses.points, _POINT_ASTRAY)
+    finite = np.isfinite(poses.points).all(1)
+    # At a camera's centre a point has no direction; splats there are in no view, or cover that camera's whole view.
+    usable[finite] &= cKDTree(centres).query(poses.points[finite])[0] > _AT_CAMERA * extent
     if not usable.all():
         text = "left out %d of %d points: they are at the centre of a camera, or far from all others"
         log.warning(text, len(usable) - usable.sum(), len(usable))
@@ -392,21 +397,6 @@ def _camera(image: ColmapImage, lens: Pinhole, frame: Frame) -> Camera:
         return camera.to(dtype=torch.float32)
     except ValueError as error:
         raise SceneError(f"camera {image.camera_id} of image {image.name}: {error}; run COLMAP again") from error
-
-
-# Distance from a camera's centre, in extents, within which a point is a failed triangulation, not a surface.
-_AT_CAMERA = 1e-6
-
-
-def _away_from(centres: Float64s, points: Float64s, radius: float) -> Bools:
-    """Which points ``[P, 3]`` are more than ``radius`` from all ``centres [V, 3]``, or not finite.
-
-    At a camera's centre a point has no direction; splats there are in no view, or cover that camera's whole view.
-    """
-    away = np.ones(len(points), bool)
-    finite = np.isfinite(points).all(1)
-    away[finite] = cKDTree(centres).query(points[finite])[0] > radius
-    return away
 
 
 # High-pass value, of grey values up to 255, from which a pixel counts as detailed: well above the noise of a photo.
