@@ -221,15 +221,11 @@ _MAX_COORDINATE = 1e30
 
 def _rigid_view(rotation: Float64s, position: Float64s) -> Tensor:
     """:func:`~nsvq_lightning.rendering.poses.view_from` of numbers that may be anything."""
-    if not _is_rotation(rotation) or position.shape != (3,) or not (np.abs(position) < _MAX_COORDINATE).all():
+    is_rigid = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    is_place = position.shape == (3,) and (np.abs(position) < _MAX_COORDINATE).all()
+    if not (is_rigid and is_place and np.linalg.det(rotation) > 0):
         raise ValueError("a pose is not a rotation and a position")
     return view_from(rotation, position)
-
-
-def _is_rotation(matrix: Float64s) -> bool:
-    if matrix.shape != (3, 3) or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3):
-        return False
-    return bool(np.linalg.det(matrix) > 0)
 
 
 def _arc(angles: Float64s) -> tuple[float, float]:
