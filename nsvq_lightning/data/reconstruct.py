@@ -486,7 +486,11 @@ def write_frames(video: Path, folder: Path, count: int, report: Report) -> list[
     Raises:
         SceneError: The file is not a video that can be read.
     """
-    total = _frame_count(video)
+    total = int(cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FRAME_COUNT))
+    if total <= 0:  # some containers do not say
+        total = sum(1 for _ in _frames(video, lambda _: None))
+    if not total:
+        raise SceneError(f"{video}: no frame can be read; convert it with 'ffmpeg -i {video.name} converted.mp4'")
     names = []
     last = None
     frames = _frames(video, lambda done: report("choosing frames", done, total))
@@ -500,15 +504,6 @@ def write_frames(video: Path, folder: Path, count: int, report: Report) -> list[
         write_bytes(folder / names[-1], written.tobytes())
         last = tiny
     return names
-
-
-def _frame_count(video: Path) -> int:
-    total = int(cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FRAME_COUNT))
-    if total <= 0:  # some containers do not say
-        total = sum(1 for _ in _frames(video, lambda _: None))
-    if not total:
-        raise SceneError(f"{video}: no frame can be read; convert it with 'ffmpeg -i {video.name} converted.mp4'")
-    return total
 
 
 def _frames(video: Path, done: Callable[[int], None]) -> Iterator[tuple[int, MatLike]]:
