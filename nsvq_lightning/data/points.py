@@ -8,7 +8,7 @@ import torch
 
 from nsvq_lightning.data.colmap import SceneError, rgb_bytes
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.io.ply import PlyHeader, read_ply_columns, read_ply_header
+from nsvq_lightning.io.ply import read_ply_columns, read_ply_header
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.poses import looked_at, poses
@@ -25,7 +25,9 @@ def read_points(path: Path) -> tuple[Float64s, Uint8s]:
         raise SceneError(f"points {path} do not exist: copy the file, or remove ply_file_path from the transforms file")
     try:
         header = read_ply_header(path)
-        known = _properties(header)
+        # By their names in lower case, also without what some programs put before these.
+        known = {re.sub("^(scalar|diffuse|vertex)_", "", name.lower()): name for name in header.properties}
+        known |= {name.lower(): name for name in header.properties}
         if missing := [axis for axis in "xyz" if axis not in known]:
             raise FormatError(f"{path}: its vertices have no {', '.join(missing)}")
         rgb = next((names for names in _COLORS if known.keys() >= {*names}), ())
@@ -44,12 +46,6 @@ def read_points(path: Path) -> tuple[Float64s, Uint8s]:
 
 # Names of three properties that are a colour, in the order in which they are looked for: those of splats come third.
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("f_dc_0", "f_dc_1", "f_dc_2"), ("intensity",) * 3)
-
-
-def _properties(header: PlyHeader) -> dict[str, str]:
-    """The properties by their name in lower case, without what some programs put before it."""
-    bare = {re.sub("^(scalar|diffuse|vertex)_", "", name.lower()): name for name in header.properties}
-    return bare | {name.lower(): name for name in header.properties}
 
 
 # Point clouds of other programs, in the folder that their cameras are in.
