@@ -272,23 +272,15 @@ def canonical(scales: Tensor, quats: Tensor) -> Canonical:
     quats = torch.where(directed, quats, torch.eye(4, dtype=quats.dtype, device=quats.device)[0])
     lengths = torch.where(directed, squared, 1.0).sqrt()
     order = scales.argsort(dim=1, descending=True, stable=True)
-    turns = _turns_to(order, quats)
+    # The order fixes a rotation up to half turns around the axes; of these four, the one with the largest w.
+    number = 2 * order[:, 0] + (order[:, 1] > order[:, 2])
+    each = _TURNS.to(quats)
+    turns = each[number, _apply(each[:, :, 0][number], quats).abs().argmax(1)]
     turned = _apply(turns, quats)
     signs = torch.where(turned[:, :1] < 0, -1.0, 1.0).to(quats)
     axes = torch.eye(3, dtype=scales.dtype, device=scales.device)
     quat_maps = (signs * lengths)[:, :, None] * turns
     return Canonical(scales.gather(1, order), signs * turned / lengths, axes[order], quat_maps)
-
-
-def _turns_to(order: Tensor, quats: Tensor) -> Tensor:
-    """Orthogonal matrices ``[N, 4, 4]`` that turn quaternions to axes in ``order [N, 3]`` by the smallest angle.
-
-    The order fixes a rotation up to half turns around the axes; of these four, it takes the one with the largest w.
-    """
-    number = 2 * order[:, 0] + (order[:, 1] > order[:, 2])
-    turns = _TURNS.to(quats)
-    w = _apply(turns[:, :, 0][number], quats)
-    return turns[number, w.abs().argmax(1)]
 
 
 def _apply(matrices: Tensor, rows: Tensor) -> Tensor:
