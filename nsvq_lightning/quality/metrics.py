@@ -92,17 +92,13 @@ def build_lpips() -> tuple[Metric | None, str | None]:
     Returns:
         The metric (images ``[1, 3, H, W]``) and None, or None and the reason why it is not available here.
     """
+    obstacle = "needs torchvision (pip install 'nsvq-lightning[lpips]')"
     try:
         import torchvision  # noqa: F401
-    except (ImportError, RuntimeError, OSError) as error:
-        return None, f"LPIPS needs torchvision (pip install 'nsvq-lightning[lpips]'): {_first_line(error)}"
-    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
-    try:
+        obstacle = "could not load the VGG-16 weights (a download of 528 MB)"
         return LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=False), None
     except (ImportError, RuntimeError, OSError) as error:
-        return None, f"LPIPS could not load the VGG-16 weights (a download of 528 MB): {_first_line(error)}"
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+        first, *_ = str(error).splitlines() or [type(error).__name__]
+        return None, f"LPIPS {obstacle}: {first}"
