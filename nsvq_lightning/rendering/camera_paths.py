@@ -111,7 +111,7 @@ def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     return path
 
 
-def read_camera_path(path: Path, width: int | None = None, height: int | None = None) -> tuple[list[Camera], float]:
+def read_camera_path(path: Path) -> tuple[list[Camera], float]:
     """The cameras of nerfstudio's camera path, and its frames per second.
 
     Of a file that has only ``keyframes``, these are the cameras. Poses are those of the scene: nerfstudio's own files
@@ -120,19 +120,16 @@ def read_camera_path(path: Path, width: int | None = None, height: int | None = 
     Args:
         path: JSON with ``camera_path`` (``camera_to_world``, 16 numbers row by row; ``fov``, vertical, degrees), or
             ``keyframes`` (``matrix``, row by row or column by column).
-        width: Pixels; by default the file's.
-        height: Pixels; by default the file's.
 
     Raises:
-        ValueError: It is not such a file, or has no size and none is given.
+        ValueError: It is not such a file, or has no size.
         OSError: It cannot be read.
     """
     with _refused(f"{path} is not a camera path as nerfstudio and the viewer write them"):
         content = json.loads(path.read_text(encoding="utf-8"))
         entries = content.get("camera_path") or content["keyframes"]
-        width = width or int(content["render_width"])
-        height = height or int(content["render_height"])
-        cameras = [_entry_camera(entry, width, height) for entry in entries]
+        size = int(content["render_width"]), int(content["render_height"])
+        cameras = [_entry_camera(entry, *size) for entry in entries]
         if not cameras:
             raise ValueError("it has no cameras")
         return cameras, float(content.get("fps", 24))
