@@ -39,9 +39,10 @@ def step_seconds(scene: Scene, count: int, device: torch.device | str = "cpu") -
 
     def train(some: Sequence[View]) -> None:
         for view in some:
-            loss = photometric_loss(render(splats, view.camera).image, view.image, mask=view.mask)
             adam.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
+            image = render(splats, view.camera).image
+            photometric_loss(image, view.image, mask=view.mask).backward()  # type: ignore[no-untyped-call]
+            del image
             adam.step()
         torch.get_device_module(device).synchronize()
 

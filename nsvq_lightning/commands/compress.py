@@ -112,7 +112,7 @@ def run(options: argparse.Namespace) -> int:
     from nsvq_lightning.compression.compressor import Compressor
     from nsvq_lightning.compression.viewpoints import VIEWS
 
-    cameras, photos = views_of(options.input, scene.decode(), VIEWS, options.root)
+    cameras, photos = views_of(options.input, scene.tensors(), VIEWS, options.root)
     storage = Storage(options.level)
     compressor = Compressor(scene, cameras, photos, storage, options.seed, options.minutes, options.steps)
     if streamed:

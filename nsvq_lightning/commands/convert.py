@@ -172,7 +172,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     from nsvq_lightning.training.importance import floaters
 
     photos = load_scene(root)
-    splats = scene.decode().raw()
+    splats = scene.tensors()
     look = partial(render, antialiased=scene.antialiased)
 
     def views() -> Iterator[View]:
@@ -197,7 +197,7 @@ def _thinned(scene: CompressedScene, count: int, options: argparse.Namespace) ->
     from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.training.importance import contributions, most_contributing, row_weights
 
-    splats = scene.decode()
+    splats = scene.tensors()
     cameras, _ = views_of(options.inputs[0], splats, VIEWS, options.root)
     found = contributions(splats, cameras, partial(render, antialiased=scene.antialiased))
     return scene.take(most_contributing(row_weights(found), count).numpy())
@@ -208,8 +208,8 @@ def _measure(source: Path, output: Path, root: Path | None) -> None:
     from nsvq_lightning.compression.viewpoints import MEASURED, Measure
 
     original = formats.read_scene(source)
-    splats = original.decode()
+    splats = original.tensors()
     cameras, _ = views_of(source, splats, MEASURED, root)
     measure = Measure(splats, cameras, original.antialiased)
-    error = measure.error(formats.read_scene(output).decode())
+    error = measure.error(formats.read_scene(output).tensors())
     say(f"  {written_error(measure, error, source.name)}")

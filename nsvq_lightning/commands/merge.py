@@ -58,6 +58,6 @@ def run(options: argparse.Namespace) -> int:
     size = save(scene, options.output)
     say(f"{options.output}: {len(scene):,} splats in {size:,} bytes")
     look = partial(render, antialiased=scene.antialiased)
-    quality, _ = evaluate(look, scene.decode(), map(photos.view, photos.test))
+    quality, _ = evaluate(look, scene.tensors(), map(photos.view, photos.test))
     say(f"  test photos of {photos.root}: {quality:.2f} dB")
     return 0

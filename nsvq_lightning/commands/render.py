@@ -88,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
     if output.suffix and not is_video:
         raise ValueError(f"{output}: name a video ({VIDEO}), or a folder for PNGs")
     scene = trained_scene(file, options.root)
-    splats = scene.decode()
+    splats = scene.tensors()
     cameras, fps = _path(options, splats, is_video)
     device = best_device()
     raw = splats.to(device).raw()

@@ -15,7 +15,7 @@ from nsvq_lightning.splats import attributes as splat
 from nsvq_lightning.splats.conventions import Arrays, Bools, Float32s, Float64s, Integers, shN_degree, unit
 
 if TYPE_CHECKING:
-    from nsvq_lightning.splats.splats import Splats, SplatTensors
+    from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors
 
 log = logging.getLogger(__name__)
 
@@ -214,13 +214,17 @@ class CompressedScene:
         Positions stay relative to ``origin``: adding a large origin in float32 would lose the detail that
         subtracting it preserved.
         """
-        import torch
-
         from nsvq_lightning.splats.splats import Splats
 
-        return Splats.from_tensors(
-            *(torch.from_numpy(np.ascontiguousarray(self.values(name))) for name in splat.ATTRIBUTES)
-        )
+        return Splats.from_tensors(*self.tensors())
+
+    def tensors(self) -> "RawSplats":
+        """As :meth:`decode`, but without a copy of what is raw: not to be changed."""
+        import torch
+
+        from nsvq_lightning.splats.splats import RawSplats
+
+        return RawSplats(*(torch.from_numpy(np.ascontiguousarray(self.values(name))) for name in splat.ATTRIBUTES))
 
     def take(self, splats: Integers | Bools) -> "CompressedScene":
         """The scene of some of the splats, by index or by mask ``[N]``; codebooks stay as they are."""

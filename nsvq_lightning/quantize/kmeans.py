@@ -125,12 +125,14 @@ def kmeans(
     if weight is not None:
         if weight.shape != x.shape[:1] or not (weight >= 0).all() or not (weight > 0).any():
             raise ValueError(f"weight must have shape [{x.shape[0]}], no negative and at least one positive value")
-        used = weight > 0
-        x, weight = x[used], weight[used].double()
+        weight = weight.double()
+        if not (weight > 0).all():
+            x, weight = x[weight > 0], weight[weight > 0]
     if start is None:
-        distinct = x[distinct_rows(x)]
+        first = distinct_rows(x)
+        distinct = x[first] if len(first) < len(x) else x
         if len(distinct) <= k:
-            return distinct
+            return distinct.clone()
         start = rows_far_apart(distinct, k, generator) if spread else distinct[shuffled(distinct, generator)[:k]]
     centroids = start.clone()
     for _ in range(steps):
@@ -150,7 +152,8 @@ def mean_by_code(x: Tensor, codes: Tensor, codebook: Tensor, weight: Tensor | No
         sums = sum_by_code(x, codes, k, torch.float64)
         mass = torch.bincount(codes, minlength=k).double()
     else:
-        sums = sum_by_code(x * weight[:, None], codes, k)
+        # A few columns at a time: in float64, all of them would take twice the memory of the rows.
+        sums = torch.cat([sum_by_code(part * weight[:, None], codes, k) for part in x.split(8, dim=1)], dim=1)
         mass = sum_by_code(weight[:, None], codes, k)[:, 0]
     means = sums / mass.clamp_min(torch.finfo(torch.float64).tiny)[:, None]
     return torch.where(mass[:, None] > 0, means.to(codebook.dtype), codebook)

@@ -91,7 +91,7 @@ def viewer_page(
     if live is None or Path(scene_file).is_file():
         stored = read_nsvq(scene_file)
         about = f"{len(stored):,} splats, {(stored.stored_bytes or 0) / 1e6:.2f} MB. "
-        start = best_view(stored.decode(), list(cameras.values()))
+        start = best_view(stored.tensors(), list(cameras.values()))
     if live is None:
         file = base64.b64encode(Path(scene_file).read_bytes()).decode()
         source = f'<script id="file" type="text/plain">{file}</script>'

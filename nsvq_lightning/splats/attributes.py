@@ -86,6 +86,10 @@ def attribute_dims(sh_degree: int) -> dict[str, int]:
     return {name: math.prod(shape) for name, shape in attribute_shapes(sh_degree).items()}
 
 
+# Rows of a tensor that are searched at once.
+_ROWS = 1 << 16
+
+
 def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int]]:
     """Which rows are finite in all attributes.
 
@@ -97,8 +101,13 @@ def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int
     """
     masks: dict[str, Any] = {}
     for name, values in attributes.items():
-        finite = np.isfinite(values) if isinstance(values, np.ndarray) else values.isfinite()
-        masks[name] = finite.reshape(len(values), math.prod(values.shape[1:])).all(1)
+        rows = values.reshape(len(values), math.prod(values.shape[1:]))
+        if isinstance(rows, np.ndarray):
+            masks[name] = np.isfinite(rows).all(1)
+        else:  # torch makes a copy on the way
+            masks[name] = rows.new_ones(len(rows)).bool()
+            for mask, part in zip(masks[name].split(_ROWS), rows.split(_ROWS), strict=True):
+                mask.copy_(part.isfinite().all(1))
     culprits = {name: len(mask) - int(mask.sum()) for name, mask in masks.items() if not mask.all()}
     return reduce(and_, masks.values()), culprits
 

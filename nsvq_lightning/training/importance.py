@@ -42,8 +42,8 @@ def contributions(splats: SplatTensors, cameras: Iterable[Camera], render: Rende
     total = torch.zeros_like(base.opacities)
     for camera in cameras:
         with torch.enable_grad():
-            red = render(grey, camera).image[..., 0].sum()
-        (gradient,) = torch.autograd.grad(red, sh0)
+            # The graph goes at once, and the next view takes its memory.
+            (gradient,) = torch.autograd.grad(render(grey, camera).image[..., 0].sum(), sh0)
         total += gradient[:, 0, 0] / C0
     return total
 

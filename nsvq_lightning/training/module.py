@@ -319,6 +319,11 @@ class SplatModule(LightningModule):
         if not self.updates:
             self.zero_grad()
 
+    def on_train_batch_end(self, outputs: dict[str, Any] | None, batch: View, batch_idx: int) -> None:
+        """Let go of the step's graph, after all callbacks: the next one takes its memory."""
+        if outputs:
+            outputs.clear()
+
     def on_train_end(self) -> None:
         """Stop measuring the training time."""
         self.stopwatch.stop()
