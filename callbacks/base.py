@@ -31,14 +31,16 @@ class SplatCallback(Callback):
     A callback that acts at certain iterations has a method ``is_due(module, iteration)``, and acts where that is true:
     a subclass changes when by overriding it.
 
+    Attributes:
+        state: Attributes that checkpoints carry, and that have the values of the class when a fit starts.
+        passing: Attributes that have the values of the class when a fit starts, and that no checkpoint carries.
+
     Raises:
         ValueError: A setting is out of its bounds, or not finite.
     """
 
     state: ClassVar[tuple[str, ...]] = ()
-    """Attributes that checkpoints carry, and that have the values of the class when a fit starts."""
     passing: ClassVar[tuple[str, ...]] = ()
-    """Attributes that have the values of the class when a fit starts, and that no checkpoint carries."""
     _acted: ClassVar[dict[str, int]] = {}
 
     def __post_init__(self) -> None:
@@ -106,10 +108,12 @@ class WritingCallback(SplatCallback):
     """Callback that writes files: it takes the folder of the run when the run starts, not when the first file is due.
 
     A subclass that overrides these hooks calls them here first.
+
+    Attributes:
+        stages: Stages in which it writes: ``fit``, or ``test``, too.
     """
 
     stages: ClassVar[tuple[str, ...]] = ("fit",)
-    """Stages in which it writes: ``fit``, or ``test``, too."""
 
     def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Check the module, and for a test take the folder.

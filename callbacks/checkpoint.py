@@ -123,8 +123,8 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     """Iterations between two checkpoints; None is a tenth of the schedule, 0 saves only at the end of the run."""
     keep: bool = False
     """Also keep each checkpoint as ``step-<iteration>.ckpt``."""
+    # Path of ``last_path`` under the name by which Lightning looks for ``ckpt_path="best"``.
     best_model_path = ""
-    """Path of ``last_path`` under the name by which Lightning looks for ``ckpt_path="best"``."""
     _saved = -1
     _training = False
 

@@ -111,9 +111,8 @@ class CodebookInit(SplatCallback):
                     values = self.values_per_splat * len(module.splats)
                     quantizer.limit(max(1, int(values / quantizer.codebook.shape[1])))
                 weight = None if name == "scales" else weights
-                quantizer.fit(
-                    module.scene.rows(name), weight, generator=generator(module.seed, iteration, "kmeans", name)
-                )
+                draws = generator(module.seed, iteration, "kmeans", name)
+                quantizer.fit(module.scene.rows(name), weight, generator=draws)
             if trainer.world_size > 1:  # a fit may leave fewer codes, so counters and all other buffers must follow
                 distributed.follow_first(trainer.strategy, cast(nn.Module, quantizer))
         sizes = ", ".join(f"{name} {q.codebook.shape[0]}" for name, q in module.quantizers.items())
@@ -299,8 +298,8 @@ class RateDistortion(SplatCallback):
 
     strength: Positive = 2.0
     """Per cent of squared error worth one per cent of the file."""
+    # What a bit costs each splat ``[N]`` in squared error, by attribute.
     prices: dict[str, Tensor] | None = field(default=None, init=False)
-    """What a bit costs each splat ``[N]`` in squared error, by attribute."""
 
     def tell(self, module: SplatModule) -> None:
         """Tell how strongly codes are chosen by their bits."""

@@ -70,8 +70,8 @@ class PhaseSchedule(SplatCallback):
     most. ``config.yaml`` of the run has both numbers."""
     _steps = -1
     _asked = -1
+    # What this callback has set in the trainer, which a next fit does not take for what was asked.
     _max_steps: int | None = field(default=None, init=False)
-    """What this callback has set in the trainer, which a next fit does not take for what was asked."""
     passing = ("_tuned_since",)
     _tuned_since: float | None = field(default=None, init=False)
 

@@ -6,10 +6,13 @@ from typing import Annotated, NamedTuple, get_args, get_type_hints
 
 
 class Bound(NamedTuple):
-    """What a number must be unless it is None; it stands beside the type in ``Annotated``."""
+    """What a number must be unless it is None; it stands beside the type in ``Annotated``.
+
+    Attributes:
+        words: As an error says it: "must be …".
+    """
 
     words: str
-    """As an error says it: "must be …"."""
     holds: Callable[[float], bool]
 
     def __repr__(self) -> str:

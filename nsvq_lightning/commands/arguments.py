@@ -199,10 +199,10 @@ def cameras_of(path: Path, root: Path | None, means: "Float32s | None" = None) -
         SceneError: The folder is not a scene.
         ValueError: What the run has recorded is damaged.
     """
-    return _known_views(path, root, means)[0]
+    return known_views(path, root, means)[0]
 
 
-def _known_views(path: Path, root: Path | None, means: "Float32s | None") -> "tuple[dict[str, Camera], Scene | None]":
+def known_views(path: Path, root: Path | None, means: "Float32s | None") -> "tuple[dict[str, Camera], Scene | None]":
     """What :func:`_found_views` has found, if it shows the scene."""
     from nsvq_lightning.compression.viewpoints import check_cameras
 
@@ -248,8 +248,8 @@ def trained_scene(path: Path, root: Path | None) -> "CompressedScene":
     return replace(scene, cameras=trained_by(cameras))
 
 
-def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -> "tuple[list[Camera], Scene | None]":
-    """At most ``most`` views of a scene file in which its pictures count, and its photos if they are known.
+def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -> "list[Camera]":
+    """At most ``most`` views of a scene file in which its pictures count; those to train on, where photos are known.
 
     Args:
         path: The file.
@@ -260,12 +260,11 @@ def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -
     Raises:
         SceneError: The folder is not a scene.
     """
-    from nsvq_lightning.compression.viewpoints import likely_cameras
+    from nsvq_lightning.compression.viewpoints import likely_cameras, spread
 
-    cameras, photos = _known_views(path, root, splats.means.detach().cpu().numpy())
+    cameras, photos = known_views(path, root, splats.means.detach().cpu().numpy())
     if photos is not None:
-        return [photos.cameras[index] for index in photos.some_train(most)], photos
+        return [photos.cameras[index] for index in photos.some_train(most)]
     if not cameras:
-        # A square picture with the pixels of a photo: what a wide one shows at its edges, photos seldom do.
-        return likely_cameras(splats, most, 640, 640, degrees=50), None
-    return list(cameras.values())[:: math.ceil(len(cameras) / most)], None
+        return likely_cameras(splats, most, 640, 640, degrees=50)
+    return list(spread(list(cameras.values()), most))

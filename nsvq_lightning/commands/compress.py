@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import add_root, positive, trained_scene, views_of
+from nsvq_lightning.commands.arguments import add_root, known_views, positive, trained_scene
 from nsvq_lightning.io.atomic import write_bytes
 from nsvq_lightning.io.formats import FORMATS
 from nsvq_lightning.io.lod import NAME
@@ -110,11 +110,11 @@ def run(options: argparse.Namespace) -> int:
     scene = trained_scene(options.input, options.root)
     most = splats_left(options.splats, len(scene))
     from nsvq_lightning.compression.compressor import Compressor
-    from nsvq_lightning.compression.viewpoints import VIEWS
 
-    cameras, photos = views_of(options.input, scene.tensors(), VIEWS, options.root)
+    cameras, photos = known_views(options.input, options.root, scene.means)
+    given = [] if photos else list(cameras.values())
     storage = Storage(options.level)
-    compressor = Compressor(scene, cameras, photos, storage, options.seed, options.minutes, options.steps)
+    compressor = Compressor(scene, given, photos, storage, options.seed, options.minutes, options.steps)
     if streamed:
         _write_levels(options, compressor, most)
     else:

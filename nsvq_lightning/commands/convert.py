@@ -82,6 +82,8 @@ def run(options: argparse.Namespace) -> int:
     scene = _edited(CompressedScene.joined([read(path) for path in options.inputs]), options)
     writer = {"palette": options.palette, "version": options.spz_version, "axes": options.spz_axes}
     given = {name: value for name, value in writer.items() if value is not None}
+    if entry.in_order is not None:  # at once, so that no copy is held beside it
+        scene = entry.in_order(scene)
     size = formats.save(scene, output, Storage(options.level) if options.level else None, **given)
     # What reading the output back would say of it is known here.
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
@@ -184,10 +186,8 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
 
     removed = floaters(splats, views, look)
     before, after = psnr(torch.ones_like(removed)), psnr(~removed)
-    say(
-        f"floaters: {int(removed.sum()):,} of {len(scene):,} splats; test photos at {before:.2f} dB before, "
-        f"{after:.2f} dB after"
-    )
+    count = int(removed.sum())
+    say(f"floaters: {count:,} of {len(scene):,} splats; test photos at {before:.2f} dB before, {after:.2f} dB after")
     return scene.take((~removed).numpy())
 
 
@@ -198,7 +198,7 @@ def _thinned(scene: CompressedScene, count: int, options: argparse.Namespace) ->
     from nsvq_lightning.training.importance import contributions, most_contributing, row_weights
 
     splats = scene.tensors()
-    cameras, _ = views_of(options.inputs[0], splats, VIEWS, options.root)
+    cameras = views_of(options.inputs[0], splats, VIEWS, options.root)
     found = contributions(splats, cameras, partial(render, antialiased=scene.antialiased))
     return scene.take(most_contributing(row_weights(found), count).numpy())
 
@@ -209,7 +209,6 @@ def _measure(source: Path, output: Path, root: Path | None) -> None:
 
     original = formats.read_scene(source)
     splats = original.tensors()
-    cameras, _ = views_of(source, splats, MEASURED, root)
-    measure = Measure(splats, cameras, original.antialiased)
+    measure = Measure(splats, views_of(source, splats, MEASURED, root), original.antialiased)
     error = measure.error(formats.read_scene(output).tensors())
     say(f"  {written_error(measure, error, source.name)}")

@@ -25,10 +25,13 @@ from nsvq_lightning.version import check_replaced
 
 
 class QuietParser(LightningArgumentParser):
-    """Reports errors without the usage, which has about a hundred lines, and lists options without their classes."""
+    """Reports errors without the usage, which has about a hundred lines, and lists options without their classes.
+
+    Attributes:
+        arguments: The command line, and what its configs set, as options.
+    """
 
     arguments: ClassVar[Sequence[str]] = ()
-    """The command line, and what its configs set, as options."""
 
     def format_help(self, *args: Any) -> str:
         """Help of a command, see :func:`command_help`."""

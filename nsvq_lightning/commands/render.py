@@ -88,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
     if output.suffix and not is_video:
         raise ValueError(f"{output}: name a video ({VIDEO}), or a folder for PNGs")
     scene = trained_scene(file, options.root)
-    splats = scene.tensors()
+    splats = scene.decode()
     cameras, fps = _path(options, splats, is_video)
     device = best_device()
     raw = splats.to(device).raw()
@@ -123,9 +123,7 @@ def _path(options: argparse.Namespace, splats: "Splats", is_video: bool) -> "tup
         fps = options.fps or own
     elif not cameras:
         if kind != "orbit":
-            raise ValueError(
-                f"--path {kind} needs the cameras of photos: name their folder (--data.root), or take orbit"
-            )
+            raise ValueError(f"--path {kind} needs cameras of photos: name their folder (--data.root), or take orbit")
         log.info("no photos: their cameras are guessed from the scene; --data.root names the folder of the photos")
         cameras = likely_cameras(splats, 24)
     width, height = options.size or (cameras[0].width, cameras[0].height)

@@ -135,18 +135,21 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers a browser."""
+    """Answers a browser.
+
+    Attributes:
+        file: A ``.nsvq`` file; that of a running fit is yet to come.
+        live: File with the splats of a fit that is followed.
+        timeout: Seconds after which a connection is closed on which nothing moves.
+        followed: Whether splats of the running fit have been shown.
+    """
 
     page: bytes
     file: Path
-    """A ``.nsvq`` file; that of a running fit is yet to come."""
     live: Path | None = None
-    """File with the splats of a fit that is followed."""
     host: str
     timeout = 20.0
-    """Seconds after which a connection is closed on which nothing moves."""
     followed = False
-    """Whether splats of the running fit have been shown."""
 
     def do_GET(self) -> None:
         if not _is_own(self.headers.get("Host", ""), self.host):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from typing import Any
 
+import numpy as np
 import torch
 from lightning.pytorch import Callback
 from torch import Tensor
@@ -24,12 +25,15 @@ from nsvq_lightning.compression.viewpoints import (
     check_cameras,
     likely_cameras,
     own_scene,
+    showing,
+    spread,
 )
 from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.datamodule import SceneDataModule
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.morton import spatial_order
 from nsvq_lightning.io.nsvq.file import decode, encode
 from nsvq_lightning.io.nsvq.header import frame, unframe
 from nsvq_lightning.io.nsvq.precision import Storage
@@ -51,6 +55,8 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.training.trainer import SplatTrainer
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -90,8 +96,10 @@ SHARE = 0.7
 MIN_SPLATS = 100
 
 
-def setting_for(size: int, most: int, sh_degree: int) -> Setting:
+def setting_for(size: int, most: int, sh_degree: int, parts: int = 1) -> Setting:
     """The setting with codebooks that ``size`` bytes have room for, about, with at most ``most`` splats.
+
+    Each of the parts that a scene is trained in has codebooks of its own.
 
     Raises:
         ValueError: There is none.
@@ -100,6 +108,7 @@ def setting_for(size: int, most: int, sh_degree: int) -> Setting:
     for name in SIZES:
         sizes = {each: (codes, dims[each]) for each, codes in codebook_sizes(name).items() if dims[each]}
         fixed, bits = codebook_bits(sizes)
+        fixed *= parts
         room = int((8 * size - fixed) / (PLACE + bits))
         if room >= SHARE * most:
             break
@@ -107,7 +116,7 @@ def setting_for(size: int, most: int, sh_degree: int) -> Setting:
         raise ValueError(f"{size} bytes leave room for {max(room, 0)} of {most} splats beside codebooks: allow more")
     codes, dim = sizes.get("shN", (0, 1))
     spare = max(0.0, 8 * size - fixed - most * (PLACE + bits))
-    more = min(spare / (dim * ATTRIBUTES["shN"].code_bits), codes, most / 8)
+    more = min(spare / (parts * dim * ATTRIBUTES["shN"].code_bits), codes, most / (8 * parts))
     return Setting(min(most, room), name, more=int(more))
 
 
@@ -130,6 +139,10 @@ SLACK = 0.01
 ESTIMATES = 5
 # PSNR of a scene in photos, dB, below which these are not its own: six scenes have 19 or more, in photos of others 11.
 MIN_PSNR = 12.0
+# Splats that are trained at once, at most: with them, a process has 2 GB. Photos are of the whole, so with photos as
+# many times as many are.
+AT_ONCE = 750_000
+WITH_PHOTOS = 4
 # Steps of a training.
 MIN_STEPS = 20
 USUAL_STEPS = 500
@@ -148,19 +161,18 @@ class Compressor:
 
     Attributes:
         scene: The scene, finite.
-        cameras: Views in which errors are measured.
+        cameras: Views in which errors are measured; by default some of the photos', or else guessed ones.
         photos: Views to train on; by default, what the cameras see of the scene itself.
         storage: Level and precision.
         seed: Seed of all draws.
         minutes: What one training may take, about.
         steps: Steps of a training, at least 4; None as many as the minutes allow, at most :data:`USUAL_STEPS`, or
             :data:`THINNING` times as many.
-        measure: Measures errors.
         stopped: Whether Ctrl-C has ended a training before its end.
     """
 
     scene: CompressedScene
-    cameras: Sequence[Camera]
+    cameras: Sequence[Camera] = ()
     photos: Scene | None = None
     storage: Storage = field(default_factory=Storage)
     seed: int = 0
@@ -170,18 +182,29 @@ class Compressor:
 
     def __post_init__(self) -> None:
         self._splats = self.scene.tensors()
-        antialiased = self.scene.antialiased
-        self._render = partial(render, antialiased=antialiased)
-        self.measure = Measure(self._splats, self.cameras, antialiased)
-        views = self.photos or own_scene(self._splats, self.cameras, antialiased)
-        self.data = SceneDataModule(views, self.seed)
-        self._is_own = views.split == OWN
+        self._render = partial(render, antialiased=self.scene.antialiased)
+        known = [self.photos.cameras[index] for index in self.photos.train] if self.photos else self.cameras
+        self._known = tuple(known)
+        if not self.cameras:
+            # Square pictures with the pixels of a photo: what a wide one shows at its edges, photos seldom do.
+            self.cameras = known or likely_cameras(self._splats, VIEWS, 640, 640, degrees=50)
+        self.cameras = spread(self.cameras, VIEWS)
+        self._is_own = self.photos is None or self.photos.split == OWN
         if not self._is_own and (likeness := self._psnr(self._splats)) < MIN_PSNR:
-            raise ValueError(f"photos of {views.root} are not of this scene: its pictures have {likeness:.1f} dB there")
-        self._views = {index: views.cameras[index] for index in views.some_train(VIEWS)}
+            raise ValueError(f"photos of {self.data.scene.root} are not of this scene: it has {likeness:.1f} dB there")
         # Of settings that are not turned, which needs no training.
         self._trained = cache(self._train)
         self._weights = cache(self._row_weights)
+
+    @cached_property
+    def measure(self) -> Measure:
+        """Measures errors."""
+        return Measure(self._splats, self.cameras, self.scene.antialiased)
+
+    @cached_property
+    def data(self) -> SceneDataModule:
+        """The views to train on."""
+        return SceneDataModule(self.photos or own_scene(self._splats, self.cameras, self.scene.antialiased), self.seed)
 
     def best(
         self, splats: int, codebooks: str | None = None, target_bytes: int | None = None, max_error: float | None = None
@@ -206,10 +229,11 @@ class Compressor:
             step = exact * (small / exact) ** setting.turn
             rows, basis = components(torch.from_numpy(scene.raw["shN"]), self._weights(whole), step)
             scene = replace(scene, raw={**scene.raw, "shN": rows}, bases={"shN": basis})
-        times = (COARSER_ROWS if setting.codebooks == "none" else COARSER) ** setting.turn
-        names = [name for name in ("scales", "quats", "sh0") if name in scene.raw] or ["position", "opacity"]
+        plain = [name for name in ("scales", "quats", "sh0") if name in scene.raw]
+        times = (COARSER_ROWS if plain else COARSER) ** setting.turn
         precision = self.storage.precision
         if times > 1:
+            names = plain or ["position", "opacity"]
             coarser = {name: float(f"{times * getattr(precision, name):.3g}") for name in names}
             precision = replace(precision, **coarser)
             scene = replace(scene, config={**scene.config, "precision": coarser})
@@ -218,11 +242,12 @@ class Compressor:
     def _row_weights(self, setting: Setting) -> Tensor:
         """How much each splat counts where harmonics are put on a basis ``[N]``."""
         splats = self._trained(setting).tensors()
-        contribution = importance.contributions(splats, self._views.values(), self._render)
+        contribution = importance.contributions(splats, self.cameras, self._render)
         return importance.row_weights(contribution).sqrt()
 
     def error(self, candidate: Candidate) -> float:
         """Root mean square difference between its pictures and those of the original, for channels in [0, 1]."""
+        trim()
         return self.measure.error(candidate.scene.tensors())
 
     def quality(self, candidate: Candidate) -> float:
@@ -231,8 +256,7 @@ class Compressor:
 
     def _psnr(self, splats: SplatTensors) -> float:
         views = self.data.scene
-        some = views.test[:: -(-len(views.test) // MEASURED)]
-        return evaluate(self._render, splats, map(views.view, some))[0]
+        return evaluate(self._render, splats, map(views.view, spread(views.test, MEASURED)))[0]
 
     def finest_within(self, target: int, splats: int) -> Candidate:
         """The best file of at most ``target`` bytes and this many splats: with or without codebooks, by its quality.
@@ -256,9 +280,8 @@ class Compressor:
 
     def _fitting(self, setting: Setting, target: int) -> Candidate | None:
         """The candidate nearest to the most exact one of at most ``target`` bytes."""
-        return self._between(
-            setting, lambda each: len(each.data) <= target, is_close=lambda size: size >= (1 - SLACK) * target
-        )
+        least = (1 - SLACK) * target
+        return self._between(setting, lambda each: len(each.data) <= target, is_close=lambda size: size >= least)
 
     def _finest_coded(self, target: int, splats: int, needed: bool) -> Candidate | None:
         """The largest file with codebooks of at most ``target`` bytes; too few are refused only where it is needed."""
@@ -266,7 +289,7 @@ class Compressor:
         asked = float(target)
         for _ in range(ESTIMATES):
             try:
-                setting = setting_for(int(asked), splats, self.scene.sh_degree)
+                setting = setting_for(int(asked), splats, self.scene.sh_degree, self.parts)
             except ValueError:
                 if needed:
                     raise
@@ -344,6 +367,8 @@ class Compressor:
         sizes = {} if setting.codebooks == "none" else dict(codebook_sizes(setting.codebooks))
         if "shN" in sizes:
             sizes["shN"] += setting.more
+        if self.parts > 1 and (sizes or setting.splats < len(self.scene)):
+            return self._train_parts(setting)
         steps = max(4, self.steps or self.usual_steps(setting.splats))
         prune = steps // 4 if setting.splats < len(self.scene) else 0
         module = SplatModule(
@@ -372,12 +397,37 @@ class Compressor:
             budget = cb.SplatBudget(splats=setting.splats)
             which = [budget, phases, cb.LearningRateDecay(start=prune), cb.SplatSelection(), cb.CanonicalCovariance()]
             codes = [cb.CodebookInit(), cb.FiniteCodes(), cb.FreezeCodes()]
-            callbacks = [*which, *codes, cb.SplatProgressBar()]
-            self._fit(module, steps, callbacks)
+            self._fit(module, steps, [*which, *codes, cb.SplatProgressBar()])
         found = replace(module.compressed().finite(), origin=self.scene.origin, cameras=self.scene.cameras)
         del module
         trim()
         return found
+
+    @cached_property
+    def parts(self) -> int:
+        """In how many parts it is trained: as many as halves of halves have few enough splats."""
+        most = AT_ONCE * (1 if self._is_own else WITH_PHOTOS)
+        return 1 << max(0, math.ceil(math.log2(len(self.scene) / most)))
+
+    def _train_parts(self, setting: Setting) -> CompressedScene:
+        """Train the parts of a large scene, one after another, each with codebooks of its own.
+
+        It is trained on pictures of it alone: from cameras of the scene that show it, or from guessed ones. The minutes
+        are for a million splats.
+        """
+        found = []
+        for number, rows in enumerate(np.array_split(spatial_order(self.scene.means), self.parts)):
+            log.info("part %d of %d", number + 1, self.parts)
+            part = self.scene.take(rows)
+            minutes, steps = self.minutes * len(part) / 1e6, 1 if self.stopped else self.steps
+            cameras = showing(self._known, part.means, VIEWS)
+            own = Compressor(part, cameras, None, self.storage, self.seed, minutes, steps)
+            left = max(1, setting.splats * len(part) // len(self.scene))
+            found.append(own._train(replace(setting, splats=left)))
+            self.stopped |= own.stopped
+            del own, part
+            trim()
+        return replace(CompressedScene.joined(found), cameras=self.scene.cameras)
 
     def _fit(self, module: SplatModule, steps: int, callbacks: list[Callback]) -> None:
         """Train without Lightning's messages; Ctrl-C ends it early once there are codes."""
@@ -398,9 +448,7 @@ class Compressor:
 
     def usual_steps(self, splats: int) -> int:
         """How many steps a training of this many of the splats takes."""
-        usual = USUAL_STEPS
-        if splats < THINNED * len(self.scene):
-            usual *= THINNING
+        usual = USUAL_STEPS * (THINNING if splats < THINNED * len(self.scene) else 1)
         return max(MIN_STEPS, min(self._affordable, usual))
 
     @cached_property
@@ -458,5 +506,5 @@ def compress(
         scene = replace(scene, cameras=trained_by(cameras))
     splats = scene.tensors()
     views = own_scene(splats, cameras, scene.antialiased, photos) if photos else None
-    compressor = Compressor(scene, cameras or likely_cameras(splats, VIEWS, 640, 640, degrees=50), views, **settings)
+    compressor = Compressor(scene, cameras, views, **settings)
     return compressor.best(min(left or len(scene), len(scene)), codebooks, target_bytes, max_error).scene

@@ -3,21 +3,22 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from nsvq_lightning.data.images import ImageStore, Picture
-from nsvq_lightning.data.points import share_shown
+from nsvq_lightning.data.points import in_picture
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
 from nsvq_lightning.rendering.poses import poses, view_towards
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.conventions import Float32s, Float64s
-from nsvq_lightning.splats.splats import SplatTensors
+from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s
+from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
 # Near plane of a guessed camera, as a share of the distance to what it looks at.
 NEARNESS = 0.02
@@ -46,6 +47,11 @@ def pictures(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool 
     return [render(splats, camera, antialiased=antialiased).image.clamp(0, 1) for camera in cameras]
 
 
+def spread(rows: Any, most: int) -> Any:
+    """At most so many of the rows of a list, an array or a tensor, evenly spread."""
+    return rows[:: max(1, -(-len(rows) // most))]
+
+
 # Largest number of views in which errors are measured.
 MEASURED = 24
 
@@ -66,7 +72,7 @@ class Measure:
     """
 
     def __init__(self, original: SplatTensors, cameras: Sequence[Camera], antialiased: bool = False) -> None:
-        self.cameras = cameras[:: -(-len(cameras) // MEASURED) or 1]
+        self.cameras = spread(cameras, MEASURED)
         self._antialiased = antialiased
         self._expected = pictures(original, self.cameras, antialiased)
         if not any(bool(picture.any()) for picture in self._expected):
@@ -77,9 +83,11 @@ class Measure:
 
     def error(self, splats: SplatTensors) -> float:
         """Root mean square difference for channels in [0, 1]."""
-        found = pictures(splats, self.cameras, self._antialiased)
-        differences = (one - other for one, other in zip(found, self._expected, strict=True))
-        return math.sqrt(np.mean([float(difference.double().square().mean()) for difference in differences]))
+        squares = []
+        for camera, expected in zip(self.cameras, self._expected, strict=True):
+            (found,) = pictures(splats, [camera], self._antialiased)
+            squares.append(float((found - expected).double().square().mean()))
+        return math.sqrt(np.mean(squares))
 
 
 # Views of a scene that has no photos.
@@ -148,16 +156,37 @@ def check_cameras(cameras: Sequence[Camera], means: Float32s) -> None:
     Raises:
         ValueError: They are of another scene, or in other coordinates.
     """
-    places = means[:: -(-len(means) // SOME_SPLATS)]
-    shown = share_shown(places.astype(np.float64), list(cameras[:: -(-len(cameras) // SOME_CAMERAS)]))
+    seen = _seen(means, spread(cameras, SOME_CAMERAS))
+    shown = min(seen.any(0).mean(), (seen.mean(1) > 1e-3).mean())
     if shown < MIN_SHOWN:
         others = "they are of another scene, or in other coordinates (x right, y down, z forward)"
         raise ValueError(f"{len(cameras)} cameras show {shown:.0%} of the scene's splats: {others}")
 
 
+def _seen(means: Float32s, cameras: Sequence[Camera]) -> Bools:
+    """Which of some of the positions are in the picture of which camera ``[C, P]``."""
+    places = spread(means, SOME_SPLATS).astype(np.float64)
+    return np.stack([in_picture(places, camera) for camera in cameras])
+
+
+# Share of the splats of a part of a scene that one of its views has in the picture at least.
+MIN_OF_PART = 0.1
+
+
+def showing(cameras: Sequence[Camera], means: Float32s, most: int) -> list[Camera]:
+    """At most so many cameras that show most of the positions ``[N, 3]``, N > 0; those that show few are no use."""
+    shares = _seen(means, cameras).mean(1) if cameras else np.zeros(0)
+    best = np.argsort(-shares, kind="stable")[:most]
+    return [cameras[index] for index in best if shares[index] >= MIN_OF_PART]
+
+
 def decibels(error: float) -> float:
     """A root mean square error as PSNR in dB."""
     return math.inf if error == 0 else -20 * math.log10(error)
+
+
+# Splats that candidates are judged by, at most.
+SOME_DETAIL = 250_000
 
 
 def likely_cameras(
@@ -196,8 +225,9 @@ def likely_cameras(
     # Straight up or down, a camera has no upright.
     eyes[:, 0] += np.where(across < 0.05 * up, 0.2 * up, 0.0)
     low = round(96 * height / width)
+    some = RawSplats(*(spread(tensor, SOME_DETAIL).contiguous() for tensor in detached(splats)))
     views = zip(targets, eyes, strict=True)
-    scores = [_detail(splats, look_at(target, eye, 96, low, angle)) for target, eye in views]
+    scores = [_detail(some, look_at(target, eye, 96, low, angle)) for target, eye in views]
     best = np.argsort(-np.array(scores), kind="stable")[:count]
     return [look_at(targets[k], eyes[k], width, height, angle) for k in best]
 

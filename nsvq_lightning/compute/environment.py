@@ -19,8 +19,8 @@ if sys.platform == "linux":
 # Names under which a user may have set the same.
 _OTHER_ALLOC_CONF = {"PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_HIP_ALLOC_CONF"}
 
+# Whether idle threads spin because torch was loaded before :func:`set_defaults`.
 came_late = False
-"""Whether idle threads spin because torch was loaded before :func:`set_defaults`."""
 
 
 def set_defaults() -> None:

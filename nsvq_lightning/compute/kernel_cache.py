@@ -143,13 +143,15 @@ class KernelCache(FunctionCache):
 
     A process that finds no kernel there holds its lock until it has compiled it.
 
+    Attributes:
+        _lock: Held while this process compiles the kernel.
+
     Raises:
         RuntimeError: There is no such folder.
     """
 
     _impl_class = _Layout
     _lock: FileLock | None = None
-    """Held while this process compiles the kernel."""
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
         return sig, codegen.magic_tuple(), constants(self._py_func)

@@ -20,21 +20,24 @@ _Points = tuple[Float64s, Uint8s, Uint8s]
 
 
 class _Photo(NamedTuple):
-    """A train photo at the size of its flow, and its pinhole camera."""
+    """A train photo at the size of its flow, and its pinhole camera.
+
+    Attributes:
+        detail: Strength of the edges ``[h, w]``.
+        counts: Which pixels count ``[h, w]``; None for all.
+        rotation: World to camera ``[3, 3]``.
+        depth: Median depth of the SfM points in front of the camera, scene units.
+    """
 
     image: Uint8s
     grey: Uint8s
     detail: Uint8s
-    """Strength of the edges ``[h, w]``."""
     counts: Bools | None
-    """Which pixels count ``[h, w]``; None for all."""
     focal: Float64s
     centre: Float64s
     rotation: Float64s
-    """World to camera ``[3, 3]``."""
     position: Float64s
     depth: float
-    """Median depth of the SfM points in front of the camera, scene units."""
 
     def project(self, points: Float64s) -> tuple[Float64s, Float64s]:
         """Pixels ``[M, 2]`` and depths ``[M]`` of points ``[M, 3]``."""

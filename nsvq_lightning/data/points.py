@@ -68,15 +68,6 @@ def cloud_in(folders: list[Path]) -> Path | None:
     return None
 
 
-def share_shown(points: Float64s, cameras: list[Camera]) -> float:
-    """Share of points ``[P, 3]`` that a camera has in its picture, or of cameras that have a thousandth of the points.
-
-    Walls are disregarded. It is the smaller of the two shares; P > 0.
-    """
-    seen = np.stack([_in_picture(points, camera) for camera in cameras])
-    return float(min(seen.any(0).mean(), (seen.mean(1) > 1e-3).mean()))
-
-
 def share_seen(points: Float64s, cameras: list[Camera]) -> float:
     """Mean share of the cameras that have a point in their picture, walls disregarded."""
     return float(_sightings(points, cameras).sum()) / max(1, len(points) * len(cameras))
@@ -118,11 +109,12 @@ def _sightings(points: Float64s, cameras: list[Camera]) -> Int64s:
     """Number of cameras ``[P]`` that have each point in their picture."""
     seen = np.zeros(len(points), np.int64)
     for camera in cameras:
-        seen += _in_picture(points, camera)
+        seen += in_picture(points, camera)
     return seen
 
 
-def _in_picture(points: Float64s, camera: Camera) -> Bools:
+def in_picture(points: Float64s, camera: Camera) -> Bools:
+    """Which points ``[P, 3]`` are in the picture of a camera ``[P]``, walls disregarded."""
     column, row, _ = projected(points, camera)
     return (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
 

@@ -2,7 +2,8 @@
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors
 
 log = logging.getLogger(__name__)
+
+# Splats of a part.
+ROWS = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,9 +108,7 @@ class CompressedScene:
 
         tensors = detached(splats)._asdict()
         check_shapes(tensors)
-        return cls.from_rows(
-            {name: tensor.cpu().numpy().astype(np.float32) for name, tensor in tensors.items()}, **header
-        )
+        return cls.from_rows({name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}, **header)
 
     @classmethod
     def from_rows(cls, rows: Mapping[str, Arrays], antialiased: bool = False, **header: Any) -> "CompressedScene":
@@ -188,18 +190,13 @@ class CompressedScene:
             return None
         return Sampling.of(torch.from_numpy(self.means), self.cameras)
 
-    def rows(self, name: str, splats: slice = slice(None)) -> Float32s:
-        """An attribute ``[N, D]`` of all splats or some, bit for bit the rows of its codebook if it has one.
-
-        Args:
-            name: Attribute; positions are relative to ``origin``.
-            splats: Which splats.
-        """
+    def rows(self, name: str) -> Float32s:
+        """An attribute ``[N, D]``, bit for bit the rows of its codebook if it has one; positions without ``origin``."""
         rows: Float32s
         if name in self.codes:
-            rows = self.codebooks[name][self.codes[name][splats]]
+            rows = self.codebooks[name][self.codes[name]]
         else:
-            rows = (self.raw[name] if name in self.raw else getattr(self, name))[splats]
+            rows = self.raw[name] if name in self.raw else getattr(self, name)
         if name in self.bases:  # exact in float64 for whole numbers, so rounded once
             rows = (rows.astype(np.float64) @ self.bases[name].astype(np.float64)).astype(np.float32)
         return rows.reshape(len(rows), splat.attribute_dims(self.sh_degree)[name])
@@ -226,8 +223,8 @@ class CompressedScene:
 
         return RawSplats(*(torch.from_numpy(np.ascontiguousarray(self.values(name))) for name in splat.ATTRIBUTES))
 
-    def take(self, splats: Integers | Bools) -> "CompressedScene":
-        """The scene of some of the splats, by index or by mask ``[N]``; codebooks stay as they are."""
+    def take(self, splats: Integers | Bools | slice) -> "CompressedScene":
+        """The scene of some of the splats, by index, mask ``[N]`` or slice; codebooks stay as they are."""
         return replace(
             self,
             means=self.means[splats],
@@ -249,7 +246,16 @@ class CompressedScene:
         """The splats in Morton order of their positions, in which many formats hold them: what is near follows."""
         from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
 
-        return self.take(spatial_order(self.means))
+        return self.in_order(spatial_order(self.means))
+
+    def in_order(self, order: Integers) -> "CompressedScene":
+        """All splats in an order ``[N]``; itself, and no copy, if they are in it."""
+        return self if np.array_equal(order, np.arange(len(self))) else self.take(order)
+
+    def parts(self) -> "Iterator[CompressedScene]":
+        """The scene in parts of splats that follow each other: what is made of one at a time takes little memory."""
+        for start in range(0, max(1, len(self)), ROWS):
+            yield self.take(slice(start, start + ROWS))
 
     def cropped(self, low: Float64s, high: Float64s) -> "CompressedScene":
         """The splats whose centres are in a box, its sides included; codebooks stay as they are.
@@ -297,7 +303,7 @@ class CompressedScene:
         """The scene with other values of attributes, by the rows of their codebooks or bases where they have those.
 
         Args:
-            changes: By attribute, what makes rows ``[.., D]`` others; they are rounded to float32.
+            changes: By attribute, what makes rows ``[.., D]`` others, each by itself; they are rounded to float32.
             fields: Fields of the scene that change, too.
         """
         codebooks = dict(self.codebooks)
@@ -305,7 +311,11 @@ class CompressedScene:
         raw = dict(self.raw)
         for name, change in changes.items():
             table = next(each for each in (codebooks, bases, raw) if name in each)
-            table[name] = change(table[name]).astype(np.float32)
+            rows = table[name]
+            table[name] = np.empty((len(rows), change(rows[:1]).shape[1]), np.float32)
+            for start in range(0, len(rows), ROWS):
+                part = slice(start, start + ROWS)
+                table[name][part] = change(rows[part])
         return replace(self, codebooks=codebooks, raw=raw, bases=bases, stored_bytes=None, **fields)
 
     def with_degree(self, degree: int) -> "CompressedScene":
@@ -335,9 +345,7 @@ def _check_floats(name: str, array: Float32s, shape: tuple[int, ...]) -> None:
 
 def _check_codes(name: str, codes: Integers, codebook: Float32s, n: int, dim: int) -> None:
     if dim == 0:
-        raise ValueError(
-            f"{name} has no coefficients at SH degree 0, so no codebook; give it in raw with shape [{n}, 0]"
-        )
+        raise ValueError(f"{name} has no coefficients at SH degree 0, so no codebook; give it in raw, shape [{n}, 0]")
     rows = len(codebook)
     _check_floats(f"codebooks[{name!r}]", codebook, (rows, dim))
     if codes.shape != (n,):
@@ -362,20 +370,21 @@ def attribute_errors(read: CompressedScene, written: CompressedScene) -> dict[st
         ``position`` in scene units, ``rotation`` in degrees, ``log-scale``, ``opacity`` in [0, 1], and the coefficients
         ``sh0`` and ``shN``; 0 where there is nothing to compare.
     """
-    read = read.with_degree(written.sh_degree)
+    sums = defaultdict[str, float](float)
+    for one, other in zip(read.parts(), written.parts(), strict=True):
+        for name, error in _differences(one.with_degree(written.sh_degree), other).items():
+            sums[name] += float(np.square(error).sum()) / max(1, math.prod(error.shape[1:]) * len(written))
+    return {name: math.sqrt(total) for name, total in sums.items()}
+
+
+def _differences(read: CompressedScene, written: CompressedScene) -> dict[str, Float64s]:
+    """Differences ``[N, ...]`` of the same splats, as :func:`attribute_errors` names them."""
     units = unit(read.rows("quats"))
     others = unit(written.rows("quats"))
     nearer = np.minimum(np.linalg.norm(units - others, axis=1), np.linalg.norm(units + others, axis=1))
-
-    def difference(name: str) -> Arrays:
-        return read.rows(name) - written.rows(name).astype(np.float64)
-
-    errors = {
-        "position": difference("means"),
+    named = {"position": "means", "log-scale": "scales", "sh0": "sh0", "shN": "shN"}
+    return {
         "rotation": np.degrees(4 * np.arcsin(np.minimum(nearer / 2, 1))),
-        "log-scale": difference("scales"),
         "opacity": opacity_of(read.opacities) - opacity_of(written.opacities),
-        "sh0": difference("sh0"),
-        "shN": difference("shN"),
+        **{quantity: read.rows(name) - written.rows(name).astype(np.float64) for quantity, name in named.items()},
     }
-    return {name: float(np.sqrt(np.mean(np.square(error)))) if error.size else 0.0 for name, error in errors.items()}

@@ -48,9 +48,9 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
     """
     scene = rotated(scene, HALF_TURN)
     opacities = opacity_of(scene.opacities)
-    colors = np.concatenate([scene.values("sh0"), scene.values("shN")], axis=1)
+    base, higher = scene.rows("sh0"), scene.values("shN")
     # The fallback is linear light; what the splats have is meant for display.
-    shown = np.clip(0.5 + SH_C0 * colors[:, 0].astype(np.float64), 0, 1)
+    shown = np.clip(0.5 + SH_C0 * base.astype(np.float64), 0, 1)
     linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     arrays: dict[str, Arrays] = {
         "POSITION": scene.means,
@@ -58,7 +58,8 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
         f"{EXTENSION}:ROTATION": unit(scene.rows("quats"))[:, [1, 2, 3, 0]].astype(np.float32),
         f"{EXTENSION}:SCALE": np.exp(scene.rows("scales")),
         OPACITY: opacities.astype(np.float32)[:, None],
-        **{_harmonic(number): colors[:, number] for number in range(colors.shape[1])},
+        _harmonic(0): base,
+        **{_harmonic(number + 1): higher[:, number] for number in range(higher.shape[1])},
     }
     kinds = {width: name for name, width in _WIDTHS.items()}
     views: list[Json] = []

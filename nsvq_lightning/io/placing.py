@@ -98,6 +98,5 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
 def placed(scene: CompressedScene, frame: "Frame") -> CompressedScene:
     """The scene in the coordinates of its files, from those of the frame that it was trained in."""
     means = frame.unit * scene.means.astype(np.float64) + frame.middle
-    return scene.changed(
-        {"scales": lambda rows: rows + np.log(frame.unit)}, means=means.astype(np.float32), origin=frame.origin
-    )
+    scales = {"scales": lambda rows: rows + np.log(frame.unit)}
+    return scene.changed(scales, means=means.astype(np.float32), origin=frame.origin)

@@ -372,8 +372,10 @@ def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, 
         levels = _table(path, header.others["sh"])
         # Bytes stand for the middles of 256ths, the first and the last for the ends.
         values = (8 * (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1] - 0.5)).astype(np.float32)
-        columns = [values[levels[name]] for name in _needed(header, sh_degree)["shN"]]
-        rows["shN"] = np.stack(columns, axis=1)
+        names = _needed(header, sh_degree)["shN"]
+        rows["shN"] = np.empty((header.count, len(names)), np.float32)
+        for column, name in zip(rows["shN"].T, names, strict=True):
+            column[:] = values[levels[name]]
     return rows
 
 
@@ -404,8 +406,8 @@ def write_ply(path: StrPath, scene: CompressedScene) -> int:
     """
     with atomic_write(path) as file:
         file.write(_header({"vertex": (len(scene), _plain_row(scene.sh_degree))}, scene.antialiased))
-        for start in range(0, len(scene), _ROWS):
-            columns = {name: scene.rows(name, slice(start, start + _ROWS)) for name in ATTRIBUTES}
+        for part in scene.parts():
+            columns = {name: part.rows(name) for name in ATTRIBUTES}
             columns["shN"] = _by_color(columns["shN"])
             columns["unused"] = np.zeros((len(columns["means"]), len(_UNUSED)), np.float32)
             table = np.concatenate([columns[name] for name in _ORDER], axis=1)
@@ -425,6 +427,13 @@ def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
         Bytes of the file.
     """
     scene = scene.in_morton_order()
+    parts = [_packed_part(part) for part in scene.parts()]
+    tables = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return write_elements(path, tables, scene.antialiased)
+
+
+def _packed_part(scene: CompressedScene) -> dict[str, NDArray[np.void]]:
+    """The elements of a part that begins with a chunk."""
     colors = np.asarray(0.5 + SH_C0 * scene.rows("sh0"), np.float32)
     values = np.stack([scene.means, scene.rows("scales").clip(-20, 20), colors], axis=1)
     starts = np.arange(0, len(scene), _CHUNK)
@@ -444,11 +453,10 @@ def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
     if scene.sh_degree:
         levels = np.clip(32 * _by_color(scene.rows("shN")) + 128, 0, 255).astype(np.uint8)
         tables["sh"] = dict(zip(splat_columns(scene.sh_degree)["shN"], levels.T, strict=True))
-    elements = {
+    return {
         name: np.rec.fromarrays([*table.values()], [(column, values.dtype) for column, values in table.items()])
         for name, table in tables.items()
     }
-    return write_elements(path, elements, scene.antialiased)
 
 
 def write_elements(path: StrPath, elements: Mapping[str, NDArray[np.void]], antialiased: bool = False) -> int:

@@ -401,12 +401,8 @@ def read_sog(path: StrPath) -> CompressedScene:
     with naming_file(path):
         data, size = _archived(Path(path))
         archive = _Archive(data)
-        sh0, opacities = archive.colors()
-        raw = {
-            "quats": archive.quats(),
-            "scales": archive.values("scales", archive.texels("scales")[:, :3]),
-            "sh0": sh0,
-        }
+        raw = {"quats": archive.quats(), "scales": archive.values("scales", archive.texels("scales")[:, :3])}
+        raw["sh0"], opacities = archive.colors()
         codes, codebooks = {}, {}
         if archive.sh_degree:
             codebooks["shN"], codes["shN"] = archive.palette()

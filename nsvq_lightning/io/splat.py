@@ -14,6 +14,7 @@ import logging
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, write_bytes
 from nsvq_lightning.io.compressed import CompressedScene
@@ -41,6 +42,14 @@ def write_splat(path: StrPath, scene: CompressedScene) -> int:
         advice = "switch it on in the viewer, or small splats look too thick"
         logger.warning("%s: the file cannot say that the scene was trained with anti-aliasing: %s", path, advice)
     clamped = Clamped()
+    records = np.concatenate([_records(part, clamped) for part in scene.parts()])
+    clamped.warn(path, len(scene))
+    write_bytes(path, records.tobytes())
+    return records.nbytes
+
+
+def _records(scene: CompressedScene, clamped: Clamped) -> NDArray[np.void]:
+    """The splats as they are in the file."""
     records = np.empty(len(scene), _RECORD)
     records["means"] = scene.means
     scales = scene.rows("scales")
@@ -52,9 +61,7 @@ def write_splat(path: StrPath, scene: CompressedScene) -> int:
     records["colors"][:, :3] = clamped.nearest("sh0", colors, (0, 255))
     records["colors"][:, 3] = bytes_of(scene.opacities)
     records["quats"] = _packed_quats(scene.rows("quats"))
-    clamped.warn(path, len(scene))
-    write_bytes(path, records.tobytes())
-    return records.nbytes
+    return records
 
 
 def _packed_quats(quats: Float32s) -> Uint8s:

@@ -47,7 +47,7 @@ from nsvq_lightning.io.errors import FormatError, check_room, naming_file, wrong
 from nsvq_lightning.io.numbers import Clamped, bytes_of, logits_of_bytes
 from nsvq_lightning.io.placing import UP_AXES, rotated
 from nsvq_lightning.splats import conventions
-from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims
+from nsvq_lightning.splats.attributes import QUANTIZABLE
 from nsvq_lightning.splats.conventions import Arrays, Float32s, Uint8s, Uint32s
 
 logger = logging.getLogger(__name__)
@@ -281,7 +281,7 @@ def in_spz_order(scene: CompressedScene) -> CompressedScene:
     """
     scene = scene.in_morton_order()
     codes = [scene.codes[name] for name in QUANTIZABLE if name in scene.codes]  # shN, the last, sorts first
-    return scene.take(np.lexsort([np.arange(len(scene)), *codes]))
+    return scene.in_order(np.lexsort([np.arange(len(scene)), *codes]))
 
 
 # Versions that are written; every reader of the format supports the default.
@@ -355,11 +355,8 @@ def _fraction_bits(scene: CompressedScene) -> int:
 
 
 def _packed(scene: CompressedScene, name: str, factor: float | Float32s, zero: float, clamped: Clamped) -> Uint8s:
-    found = np.empty((len(scene), attribute_dims(scene.sh_degree)[name]), np.uint8)
-    for start in range(0, len(scene), 1 << 16):  # so that temporary arrays stay small
-        block = slice(start, start + (1 << 16))
-        found[block] = clamped.nearest(name, factor * scene.rows(name, block) + zero, (0, 255))
-    return found
+    values = (factor * part.rows(name) + zero for part in scene.parts())
+    return np.concatenate([clamped.nearest(name, each, (0, 255)).astype(np.uint8) for each in values])
 
 
 def _packed_quats(rows: Float32s) -> Uint32s:
@@ -400,7 +397,7 @@ def read_spz(path: StrPath) -> CompressedScene:
             "scales": arrays["scales"] / 16 - 10,
             "opacities": logits_of_bytes(arrays["opacities"]),
             "sh0": (arrays["sh0"] / 255 - 0.5) / _COLOR,
-            "shN": (arrays["shN"][:, : len(harmonics)].astype(np.float32) - 128) / 128 * harmonics,
+            "shN": _unpacked_harmonics(arrays["shN"], harmonics),
         },
         antialiased=bool(header.flags & ANTIALIASED),
     )
@@ -415,6 +412,12 @@ def _unpacked_means(header: SpzHeader, data: Uint8s) -> NDArray[np.floating[Any]
     wide = np.zeros((header.count, 3, 4), np.uint8)
     wide[:, :, 1:] = data.reshape(header.count, 3, 3)
     return (wide.view("<i4")[:, :, 0] >> 8) / (1 << header.fraction_bits)
+
+
+def _unpacked_harmonics(data: Uint8s, signs: Float32s) -> Float32s:
+    rows = data[:, : len(signs)].astype(np.float32)
+    rows -= 128
+    return np.multiply(rows, signs / 128, out=rows)  # powers of two
 
 
 def _unpacked_quats(header: SpzHeader, data: Uint8s) -> Float32s:

@@ -14,7 +14,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
 from nsvq_lightning.io.numbers import logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, UP_AXES, moved, rotated
-from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, unit
+from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, sh_coefficients, unit
 
 log = logging.getLogger(__name__)
 
@@ -31,16 +31,17 @@ def write_usda(path: StrPath, scene: CompressedScene) -> int:
         Bytes of the file.
     """
     scene = rotated(scene, HALF_TURN)
-    colors = np.concatenate([scene.rows("sh0"), scene.rows("shN")], axis=1)
-    arrays: dict[str, Arrays] = {
-        "point3f[] positions": scene.means,
-        "quatf[] orientations": unit(scene.rows("quats")),
-        "float3[] scales": np.exp(scene.rows("scales").astype(np.float64)),
-        "float[] opacities": opacity_of(scene.opacities)[:, None],
-        f"float3[] {_COEFFICIENTS}": colors.reshape(-1, 3),
-        "float3[] extent": np.stack([scene.means.min(0), scene.means.max(0)]),
+    coefficients = 1 + sh_coefficients(scene.sh_degree)
+    # Each as columns of rows, which are written as rows of so many numbers.
+    arrays: dict[str, tuple[int, list[Arrays]]] = {
+        "point3f[] positions": (3, [scene.means]),
+        "quatf[] orientations": (4, [unit(scene.rows("quats"))]),
+        "float3[] scales": (3, [np.exp(scene.rows("scales").astype(np.float64))]),
+        "float[] opacities": (1, [opacity_of(scene.opacities)[:, None]]),
+        f"float3[] {_COEFFICIENTS}": (3, [scene.rows("sh0"), scene.rows("shN")]),
+        "float3[] extent": (3, [np.stack([scene.means.min(0), scene.means.max(0)])]),
     }
-    about_colors = f' (\n        elementSize = {colors.shape[1] // 3}\n        interpolation = "vertex"\n    )'
+    about_colors = f' (\n        elementSize = {coefficients}\n        interpolation = "vertex"\n    )'
     note = "    customData = { bool antialiased = 1 }\n" if scene.antialiased else ""
     with atomic_write(path) as file:
         file.write(
@@ -50,13 +51,13 @@ def write_usda(path: StrPath, scene: CompressedScene) -> int:
             '    uniform token projectionModeHint = "perspective"\n'
             '    uniform token sortingModeHint = "cameraDistance"\n'.encode()
         )
-        for name, values in arrays.items():
+        for name, (width, columns) in arrays.items():
             file.write(f"    {name} = [".encode())
-            row = ", ".join(["%.9g"] * values.shape[1])
-            if values.shape[1] > 1:
+            row = ", ".join(["%.9g"] * width)
+            if width > 1:
                 row = f"({row})"
-            for start in range(0, len(values), _ROWS):
-                block = values[start : start + _ROWS]
+            for start in range(0, len(columns[0]), _ROWS):
+                block = np.concatenate([each[start : start + _ROWS] for each in columns], axis=1).reshape(-1, width)
                 text = ", ".join([row] * len(block)) % tuple(block.ravel().tolist())
                 file.write((", " * bool(start) + text).encode())
             file.write(f"]{about_colors if _COEFFICIENTS in name else ''}\n".encode())

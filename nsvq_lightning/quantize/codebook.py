@@ -332,16 +332,18 @@ class Quantizer(Protocol):
 
     Callbacks also use what they find of ``held`` and ``hold``, ``refit``, ``limit`` and ``mend`` of
     :class:`~nsvq_lightning.quantize.CodebookQuantizer`, and leave a quantizer without them alone.
+
+    Attributes:
+        codebook: Codebook ``[K, D]`` in the raw space of the attribute.
+        codes: Frozen codes ``[N]`` int64, empty until :meth:`freeze`.
+        usage: Iterations of the current window in which each code was hit at least once, ``[K]`` int64.
+        window: Iterations in the current window, scalar int64.
     """
 
     codebook: Tensor
-    """Codebook ``[K, D]`` in the raw space of the attribute."""
     codes: Tensor
-    """Frozen codes ``[N]`` int64, empty until :meth:`freeze`."""
     usage: Tensor
-    """Iterations of the current window in which each code was hit at least once, ``[K]`` int64."""
     window: Tensor
-    """Iterations in the current window, scalar int64."""
 
     def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
         """Place the codebook on the rows ``x [N, D]`` (k-means); ``K`` shrinks to the number of distinct rows."""

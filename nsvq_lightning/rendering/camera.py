@@ -20,6 +20,9 @@ class Camera:
         width: Image width in pixels.
         height: Image height in pixels.
         near: Splats whose centre is nearer than this along the viewing axis are not seen, scene units.
+        intrinsics: ``(fx, fy, cx, cy)`` in pixels.
+        packed_view: Rotation row by row, translation and camera position: 15 numbers in float64, the same on every
+            machine.
 
     Raises:
         ValueError: A matrix has another shape, the image is empty, the focal lengths or ``near`` are not positive and
@@ -32,9 +35,7 @@ class Camera:
     height: int
     near: float = NEAR
     intrinsics: tuple[float, float, float, float] = field(init=False, repr=False)
-    """``(fx, fy, cx, cy)`` in pixels."""
     packed_view: tuple[float, ...] = field(init=False, repr=False)
-    """Rotation row by row, translation and camera position: 15 numbers in float64, the same on every machine."""
 
     def __post_init__(self) -> None:
         for name, matrix, side in (("K", self.K, 3), ("viewmat", self.viewmat, 4)):

@@ -132,11 +132,13 @@ class ViewParallelStrategy(DDPStrategy):
     without one; a step in which any process has a non-finite loss updates nothing.
 
     Arguments are those of ``DDPStrategy`` that do not concern the wrapper, such as ``process_group_backend``.
+
+    Attributes:
+        _failed: How many of this process's views of the step have a loss that is not finite, on its device.
     """
 
     _accumulates = False
     _failed: Tensor | None = None
-    """How many of this process's views of the step have a loss that is not finite, on its device."""
 
     def configure_ddp(self) -> None:
         """Copy the first process's parameters and buffers."""
@@ -183,8 +185,6 @@ class ViewParallelStrategy(DDPStrategy):
 
 
 # How its processes start, by its name: as commands of their own or, from a notebook, as copies of this process.
-for _suffix, _start in {"": "popen", "_spawn": "spawn", "_fork": "fork", "_notebook": "fork"}.items():
+for _end, _start in {"": "popen", "_spawn": "spawn", "_fork": "fork", "_notebook": "fork"}.items():
     _about = f"A replica on each device, one view each per step; processes start by {_start}"
-    StrategyRegistry.register(
-        f"view_parallel{_suffix}", ViewParallelStrategy, _about, override=True, start_method=_start
-    )
+    StrategyRegistry.register(f"view_parallel{_end}", ViewParallelStrategy, _about, override=True, start_method=_start)

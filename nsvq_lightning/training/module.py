@@ -70,6 +70,32 @@ class SplatModule(LightningModule):
         init_from: Scene file of any format to start from, without its non-finite splats.
         splats: Splats to start from, for use from Python. A fit takes them into the :attr:`frame` of its scene.
 
+    Attributes:
+        splats: The splats, in :attr:`frame`; rows are edited only through :mod:`nsvq_lightning.training.row_ops`.
+        quantizer_settings: Class and number of codes of each quantizer by attribute, as requested; k-means may give
+            fewer codes.
+        frame: Coordinates of the splats; the module is given cameras, and makes files, in those of the files.
+        cameras: Of training ``[C, 4]``, as files keep them (:func:`nsvq_lightning.rendering.sampling.trained_by`).
+        extent: Of the cameras, in units of the frame; 0 while unknown.
+        schedule: Phases and milestones of the run.
+        phase: Phase of the current iteration.
+        active_sh_degree: SH degree that is rendered; higher coefficients are ignored.
+        history: Evaluations so far, one plain dictionary each; checkpoints carry it.
+        stopwatch: Time spent training.
+        loss_terms: Terms of the loss by name; callbacks add some, or wrap the first.
+        pixel_weights: Strength ``[H, W]`` of the pixels of the next view, whose rendering then has ``absgrad``, or
+            None.
+        splat_budget: How many splats the scene is to have in the end; None for as many as density control makes.
+        first_points: How many points of SfM and of flow the first splats are made from; None for those of SfM, as in
+            3DGS.
+        rate_strength: How strongly codes are chosen by their bits, which a budget in bytes counts on; 0 for the nearest
+            ones.
+        stretches: How many splats a run has in which shares of it, from its schedule and how many it has at start and
+            end.
+        evaluation_splats: What validation, test and prediction render instead of the module's own splats, in
+            :attr:`frame`.
+        updates: Whether this iteration is to change anything: False once a loss of this process is not finite.
+
     Raises:
         ValueError: A codebook is for an unknown attribute or has no code, or an argument is out of range.
         TypeError: What ``quantizer`` makes does not implement :class:`nsvq_lightning.quantize.codebook.Quantizer`.
@@ -96,13 +122,11 @@ class SplatModule(LightningModule):
         if not 0.0 <= dssim_weight <= 1.0:
             raise ValueError(f"dssim_weight must be between 0 and 1, got {dssim_weight}")
         self.splats = splats if splats is not None else Splats(sh_degree)
-        """The splats, in :attr:`frame`; rows are edited only through :mod:`nsvq_lightning.training.row_ops`."""
         self.codebooks = nn.ModuleDict(build_quantizers(quantizer, codebooks, self.splats))
         self.quantizer_settings = {
             name: {"quantizer": type(made).__name__, "codes": made.codebook.shape[0]}
             for name, made in self.quantizers.items()
         }
-        """Class and number of codes of each quantizer by attribute, as requested; k-means may give fewer codes."""
         self.background: str = background
         self.dssim_weight = dssim_weight
         # A checkpoint stores these two as plain dictionaries.
@@ -114,37 +138,21 @@ class SplatModule(LightningModule):
         self.init_from = init_from
         self.save_hyperparameters(ignore=["splats"])
         self.frame = Frame()
-        """Coordinates of the splats; the module is given cameras, and makes files, in those of the files."""
         self.cameras = np.zeros((0, 4))
-        """Of training ``[C, 4]``, as files keep them (:func:`nsvq_lightning.rendering.sampling.trained_by`)."""
         self.extent = 0.0
-        """Of the cameras, in units of the frame; 0 while unknown."""
         self.schedule = Schedule()
-        """Phases and milestones of the run."""
         self.phase = Phase.WARMUP
-        """Phase of the current iteration."""
         self.active_sh_degree = 0 if splats is None else splats.sh_degree
-        """SH degree that is rendered; higher coefficients are ignored."""
         self.history: list[dict[str, Any]] = []
-        """Evaluations so far, one plain dictionary each; checkpoints carry it."""
         self.stopwatch = Stopwatch()
-        """Time spent training."""
         self.loss_terms: dict[str, LossTerm] = {"photometric": partial(_photometric_term, self)}
-        """Terms of the loss by name; callbacks add some, or wrap the first."""
         self.pixel_weights: Tensor | None = None
-        """Strength ``[H, W]`` of the pixels of the next view, whose rendering then has ``absgrad``, or None."""
         self.splat_budget: int | None = None
-        """How many splats the scene is to have in the end; None for as many as density control makes."""
         self.first_points: int | None = None
-        """How many points of SfM and of flow the first splats are made from; None for those of SfM, as in 3DGS."""
         self.rate_strength = 0.0
-        """How strongly codes are chosen by their bits, which a budget in bytes counts on; 0 for the nearest ones."""
         self.stretches: Callable[[Schedule, int, int], list[tuple[float, int]]] | None = None
-        """How many splats a run has in which shares of it, from its schedule and how many it has at start and end."""
         self.evaluation_splats: SplatTensors | None = None
-        """What validation, test and prediction render instead of the module's own splats, in :attr:`frame`."""
         self.updates = True
-        """Whether this iteration is to change anything: False once a loss of this process is not finite."""
         self._step_factor = 1.0
         self._rate_factors: dict[str, float] = {}
         self._late_losses: list[tuple[str, AsyncScalar]] = []
@@ -319,7 +327,7 @@ class SplatModule(LightningModule):
         if not self.updates:
             self.zero_grad()
 
-    def on_train_batch_end(self, outputs: dict[str, Any] | None, batch: View, batch_idx: int) -> None:
+    def on_train_batch_end(self, outputs: Any, batch: View, batch_idx: int) -> None:
         """Let go of the step's graph, after all callbacks: the next one takes its memory."""
         if outputs:
             outputs.clear()

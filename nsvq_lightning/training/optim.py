@@ -86,10 +86,7 @@ def param_groups(
     """
     parameters: dict[str, Any] = dict(splats.attributes())
     parameters |= {codebook_group(name): quantizer.codebook for name, quantizer in quantizers.items()}
-    return [
-        {"params": [parameter], "lr": group_lr(name, rates, extent), "name": name}
-        for name, parameter in parameters.items()
-    ]
+    return [{"params": [each], "lr": group_lr(name, rates, extent), "name": name} for name, each in parameters.items()]
 
 
 def group_lr(name: str, rates: LearningRates, extent: float) -> float:

@@ -106,9 +106,8 @@ def splats_of_file(path: str, frame: Frame, sh_degree: int) -> Splats:
     """
     scene = read_scene(path).relative_to(frame.origin)
     if scene.sh_degree != sh_degree:
-        raise ValueError(
-            f"{path} has SH degree {scene.sh_degree}, the module {sh_degree}; set sh_degree={scene.sh_degree}"
-        )
+        degree = scene.sh_degree
+        raise ValueError(f"{path} has SH degree {degree}, the module {sh_degree}; set sh_degree={degree}")
     return Splats.from_tensors(*frame.splats(scene.decode()))
 
 

@@ -13,16 +13,19 @@ from itertools import pairwise
 
 
 class Phase(IntEnum):
-    """Phase of a run (paper, section 4.1)."""
+    """Phase of a run (paper, section 4.1).
+
+    Attributes:
+        WARMUP: Plain 3D Gaussian splatting with density control.
+        PRUNE: Opacity regularisation, no new splats.
+        QUANTIZE: Splats and codebooks are trained together through noise substitution.
+        FINETUNE: Codes are frozen; training of codebooks, positions and opacities continues.
+    """
 
     WARMUP = 0
-    """Plain 3D Gaussian splatting with density control."""
     PRUNE = 1
-    """Opacity regularisation, no new splats."""
     QUANTIZE = 2
-    """Splats and codebooks are trained together through noise substitution."""
     FINETUNE = 3
-    """Codes are frozen; training of codebooks, positions and opacities continues."""
 
 
 @dataclass(frozen=True)

@@ -52,10 +52,8 @@ def kernel_errors(device: str) -> dict[str, dict[str, float]]:
 def _step(backend: str, device: str, dtype: torch.dtype) -> dict[str, Tensor]:
     """What a training step computes for 3000 random splats and 100 random codes."""
     draw = generator(0, 0, "self check")
-    made = {
-        name: torch.randn(3000, *shape, generator=draw, dtype=torch.float64)
-        for name, shape in attribute_shapes(3).items()
-    }
+    shapes = attribute_shapes(3).items()
+    made = {name: torch.randn(3000, *shape, generator=draw, dtype=torch.float64) for name, shape in shapes}
     made["means"][:, 2] += 6
     made["scales"] -= 2.5
     photo, codebook = torch.rand(72, 96, 3, generator=draw), torch.randn(100, 4, generator=draw).to(device, dtype)

@@ -28,23 +28,27 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SplatScene:
-    """Splats in training, the codebooks that store them, and the settings that they are rendered with."""
+    """Splats in training, the codebooks that store them, and the settings that they are rendered with.
+
+    Attributes:
+        splats: The splats, in :attr:`frame`.
+        quantizers: Quantizer by attribute; empty for a run without quantization.
+        frame: Coordinates of the splats. Cameras that the scene is given, and files made of it, have those of the
+            files.
+        sh_degree: Degree that is rendered; higher coefficients are ignored.
+        background: Behind the splats; ``random`` is black here.
+        backend: Rasterizer, see :func:`nsvq_lightning.render`.
+        cameras: Cameras of training ``[C, 4]`` that files keep, see :attr:`CompressedScene.cameras`.
+    """
 
     splats: Splats
-    """The splats, in :attr:`frame`."""
     quantizers: Mapping[str, Quantizer]
-    """Quantizer by attribute; empty for a run without quantization."""
     frame: Frame
-    """Coordinates of the splats. Cameras that the scene is given, and files made of it, have those of the files."""
     sh_degree: int
-    """Degree that is rendered; higher coefficients are ignored."""
     background: str
-    """Behind the splats; ``random`` is black here."""
     antialiased: bool
     backend: str
-    """Rasterizer, see :func:`nsvq_lightning.render`."""
     cameras: Float64s = field(default_factory=lambda: np.zeros((0, 4)))
-    """Cameras of training ``[C, 4]`` that files keep, see :attr:`CompressedScene.cameras`."""
 
     def rows(self, attribute: str) -> Tensor:
         """Rows ``[N, D]`` of a quantized attribute, detached."""

@@ -10,11 +10,14 @@ from nsvq_lightning.compute.jit import compile_seconds
 
 
 class Stopwatch:
-    """Adds the time between two laps to :attr:`seconds`, without pauses and the compilation of kernels."""
+    """Adds the time between two laps to :attr:`seconds`, without pauses and the compilation of kernels.
+
+    Attributes:
+        seconds: Seconds spent training, over all resumed parts of the run.
+    """
 
     def __init__(self) -> None:
         self.seconds = 0.0
-        """Seconds spent training, over all resumed parts of the run."""
         self._since: float | None = None
 
     def start(self) -> None:

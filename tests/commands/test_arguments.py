@@ -15,6 +15,7 @@ from nsvq_lightning.commands.arguments import (
     Parser,
     cameras_of,
     integers,
+    known_views,
     names,
     photos_of,
     positive,
@@ -102,8 +103,8 @@ def test_cameras_of_inrias_trainer_lie_up_to_two_folders_above_the_scene(tmp_pat
     (scene.parents[above] / "cameras.json").write_text(json.dumps([ENTRY]))
     assert list(cameras_of(scene, None)) == ["a"] * (above < 3)
     if above < 3:
-        views, photos = views_of(scene, random_splats(9), 5, None)
-        assert ([(view.width, view.height) for view in views], photos) == ([(8, 6)], None)
+        views = views_of(scene, random_splats(9), 5, None)
+        assert [(view.width, view.height) for view in views] == [(8, 6)]
         assert views[0].position.tolist() == [0, 0, -6]
 
 
@@ -162,8 +163,8 @@ def test_cameras_need_no_photos(tmp_path: Path, demo_scene: Path) -> None:
             torch.equal(one.viewmat, other.viewmat) for one, other in zip(found.values(), expected.cameras, strict=True)
         )
         assert [camera.intrinsics for camera in found.values()] == [each.intrinsics for each in expected.cameras]
-    views, photos = views_of(path, splats, 4, root)
-    assert (len(views), photos) == (3, None)
+    assert len(views_of(path, splats, 4, root)) == 3
+    assert known_views(path, root, splats.means.numpy())[1] is None
     _without_photos(demo_scene, tmp_path / "a")  # beside the scene, a folder above
     assert tuple(cameras_of(path, None)) == expected.names
 
@@ -182,7 +183,7 @@ def test_cameras_of_another_scene_are_not_used(
         assert len(cameras_of(path, None, splats.means.numpy())) == count
     assert "scene.ply: the cameras of the folders beside it are not used: 9 cameras show " in caplog.text
     for wrong in (root, demo_scene):
-        assert views_of(path, moved, 4, wrong)[1] is None
+        assert known_views(path, wrong, moved.means.numpy()) == ({}, None)
         assert f"the cameras of {wrong} are not used: 9 cameras show" in caplog.text
 
 

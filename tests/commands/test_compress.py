@@ -67,7 +67,7 @@ def test_photos_are_trained_on(tmp_path: Path, demo_scene: Path, capsys: pytest.
     assert f"fitted to the photos of {demo_scene}" in capsys.readouterr().out
     save(detached(splats)._replace(sh0=-4 * splats.sh0), source)
     assert main(command) == 1
-    assert f"photos of {demo_scene} are not of this scene: its pictures have " in capsys.readouterr().err
+    assert f"photos of {demo_scene} are not of this scene: it has " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("aim", "value"), [("--target-bytes", "9000"), ("--max-error", "0.2")])

@@ -64,7 +64,9 @@ def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header
         ValueError: A value is too large for its step.
     """
     with _workers() as pool:
-        tasks = {name: pool.submit(rounding.rounded, scene, name, precision) for name in (*_EARLY, *_LONGEST_FIRST)}
+        along = morton.spatial_order(scene.means)
+        names = (*_EARLY, *_LONGEST_FIRST)
+        tasks = {name: pool.submit(rounding.rounded, scene, name, precision, along) for name in names}
         early = {name: tasks[name].result() for name in _EARLY}
         grid, doublings, depths = rounding.position_grid(scene.means, early, precision)
         cells, inside = grid.cells(scene.means)
@@ -158,11 +160,11 @@ def _stream_names(attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, str
 def _encoded(attribute: rounding.Stored, order: Int64s, neighbours: Int32s) -> dict[str, bytes]:
     """The streams of an attribute, but not of the positions, for splats in an order."""
     entry = attribute.entry
-    values = attribute.values[order]
     if _STREAMS[entry.storage][""] == "paths":
-        streams = {entry.name: entropy.encode_paths(leaf_paths(entry.codes)[values], entry.bits, neighbours)}
+        paths = leaf_paths(entry.codes)[attribute.values[order]]
+        streams = {entry.name: entropy.encode_paths(paths, entry.bits, neighbours)}
     else:
-        streams = {entry.name: entropy.encode_integers(values)}
+        streams = {entry.name: entropy.encode_integers(attribute.values, order)}
     if attribute.codebook is not None:
         streams[entry.name + _TABLES[entry.storage]] = entropy.encode_integers(attribute.codebook)
     return streams

@@ -10,11 +10,11 @@ import numpy as np
 from numba import uint64
 
 from nsvq_lightning.compute.jit import inline, kernel
-from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array
+from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array, outside
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.morton import check_depths
 from nsvq_lightning.io.nsvq import range_coder as rc
-from nsvq_lightning.splats.conventions import Bools, Int32s, Int64s, Uint32s, Uint64s
+from nsvq_lightning.splats.conventions import Bools, Int32s, Int64s, Integers, Uint32s, Uint64s
 
 # Bits of a key; the highest is bit 62.
 KEY_BITS = 63
@@ -120,8 +120,8 @@ def decode_keys(data: bytes | memoryview, depths: Int64s) -> Uint64s:
     return keys
 
 
-def encode_integers(values: Int64s) -> bytes:
-    """Bytes of integers ``[N, D]`` of absolute value below 2⁵².
+def encode_integers(values: Integers, order: Int64s | None = None) -> bytes:
+    """Bytes of integers ``[N, D]`` of absolute value below 2⁵², of the rows in an order ``[N]``.
 
     Each column is written as values or as differences from row to row, whichever is smaller; one byte per column says
     which. An integer is written as its number of bits, by an adaptive model of its column, its sign, the bit after the
@@ -129,16 +129,23 @@ def encode_integers(values: Int64s) -> bytes:
 
     Raises:
         ValueError: The values are not ``[N, D]``, not contiguous, or one is too large.
-        TypeError: They are not int64.
+        TypeError: They are neither int64 nor int32.
     """
-    check_array("values", values, values.shape, INT64)
+    check_array("values", values, values.shape, INT32 if values.dtype == INT32 else INT64)
     if values.ndim != 2 or (values.size and max(-int(values.min()), int(values.max())) >= _TOO_LARGE):
         raise ValueError(f"values must have shape [N, D] and be below 2^52 in size, got {list(values.shape)}")
-    steps = np.diff(values, axis=0, prepend=0)
-    by_steps: Bools = _bit_lengths(steps).sum(0) < _bit_lengths(values).sum(0)  # approximately their bits
-    chosen = np.where(by_steps, steps, values)
-    words = _room(int(_bit_lengths(chosen).sum()) + 8 * chosen.size)
-    used = _write_integers(chosen, words, rc.new_contexts(_INTEGER_CONTEXTS * values.shape[1]))
+    order = np.arange(len(values)) if order is None else order
+    check_array("order", order, (len(values),), INT64)
+    if order.size and (order.min() < 0 or order.max() >= len(values)):
+        raise outside("order", order, len(values))
+    bits = np.empty((2, values.shape[1]), np.int64)  # approximately those of values, and of their steps
+    for column, numbers in enumerate(values.T):
+        ordered = numbers[order].astype(np.int64)
+        bits[:, column] = [_bit_lengths(each).sum() for each in (ordered, np.diff(ordered, prepend=0))]
+    by_steps: Bools = bits[1] < bits[0]
+    words = _room(int(bits.min(0).sum()) + 8 * values.size)
+    contexts = rc.new_contexts(_INTEGER_CONTEXTS * values.shape[1])
+    used = _write_integers(values, order, by_steps, words, contexts)
     return by_steps.astype(np.uint8).tobytes() + _bytes(words, used)
 
 
@@ -344,16 +351,19 @@ def _bit_lengths(values: Int64s) -> Int64s:
 
 
 @_stream_kernel
-def _write_integers(values, words, contexts):  # type: ignore[no-untyped-def]
+def _write_integers(values, order, by_steps, words, contexts):  # type: ignore[no-untyped-def]
     low, width, used = uint64(0), _START, 0
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
-            size = uint64(abs(values[i, j]))
+            value = np.int64(values[order[i], j])
+            if by_steps[j] and i > 0:
+                value -= np.int64(values[order[i - 1], j])
+            size = uint64(abs(value))
             length = _length(size)
             start = _INTEGER_CONTEXTS * j
             low, width, used = _write_length(length, start, contexts, low, width, words, used)
             if length > 0:
-                low, width, used = rc.encode_plain(values[i, j] < 0, 1, low, width, words, used)
+                low, width, used = rc.encode_plain(value < 0, 1, low, width, words, used)
             if length > 1:
                 second = np.int64(size >> uint64(length - 2)) & 1
                 context = _second_context(start, length)

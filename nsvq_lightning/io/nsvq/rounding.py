@@ -12,7 +12,7 @@ import numpy as np
 
 from nsvq_lightning.compute.jit import kernel
 from nsvq_lightning.compute.memory import check_table
-from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.compressed import ROWS, CompressedScene
 from nsvq_lightning.io.morton import Grid
 from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
@@ -34,8 +34,8 @@ class Stored(NamedTuple):
     """
 
     entry: AttributeEntry
-    values: Int64s
-    codebook: Int64s | None = None
+    values: Integers
+    codebook: Integers | None = None
 
     def row_sums(self) -> Int64s:
         """Sum ``[N]`` of each splat's integers."""
@@ -49,8 +49,14 @@ class Stored(NamedTuple):
         return np.multiply(integers, self.entry.step, out=np.empty(integers.shape, np.float32), casting="same_kind")
 
 
-def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
+def rounded(scene: CompressedScene, name: str, precision: Precision, along: Integers) -> Stored:
     """An attribute, but not the positions, as integers.
+
+    Args:
+        scene: The scene.
+        name: The attribute.
+        precision: The largest errors.
+        along: The splats ``[N]`` in an order in which neighbours follow each other.
 
     Raises:
         ValueError: A value is too large for its step.
@@ -68,21 +74,49 @@ def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
         rows = scene.raw[name]
         step = 2 * precision.of(name)
         return Stored(AttributeEntry(name, rows.shape[1], "steps", step=step), _integers(name, rows, step))
-    return _coded(name, scene.codes[name], scene.codebooks[name], precision.codebook)
+    return _coded(name, scene.codes[name], scene.codebooks[name], precision.codebook, along)
 
 
-def _coded(name: str, codes: Integers, codebook: Float32s, error: float) -> Stored:
+def _coded(name: str, codes: Integers, codebook: Float32s, error: float, along: Integers) -> Stored:
     used = np.bincount(codes, minlength=len(codebook)) > 0
     rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
     directions = unit(rows).astype(np.float32) if name == "quats" else rows
     distinct = np.unique(directions, axis=0)
     distance = sibling_distance(distinct[tree_order(distinct)])
     step = _step(rows, 2 * error * distance or 2.0**-16)
-    integers, merged = np.unique(_integers(name, rows, step), axis=0, return_inverse=True)
-    order = tree_order((integers * step).astype(np.float32))
-    new_codes = order.argsort()[merged.reshape(-1)]
+    integers, first, merged = np.unique(_integers(name, rows, step), axis=0, return_index=True, return_inverse=True)
+    merged_codes = merged.reshape(-1)[np.cumsum(used)[codes] - 1]
+    groups = _groups(first.argsort(), merged_codes[along])
+    order = np.concatenate([group[tree_order((integers[group] * step).astype(np.float32))] for group in groups])
     entry = AttributeEntry(name, rows.shape[1], "codes", len(integers), step)
-    return Stored(entry, new_codes[np.cumsum(used)[codes] - 1], integers[order])
+    return Stored(entry, order.argsort()[merged_codes], integers[order])
+
+
+# Neighbours are in different halves so many times more rarely than other splats, where a half belongs to a part.
+_APART = 10
+
+
+def _groups(rows: Int64s, codes: Integers) -> list[Int64s]:
+    """Rows ``[K]`` of a codebook in halves, and halves of these, as long as neighbours have codes of the same one.
+
+    In a joined scene, that keeps the codebooks of its parts apart: neighbours tell the first branches of a path. In
+    any other one, all rows stay together.
+
+    Args:
+        rows: In the order that they were given.
+        codes: Of the splats ``[N]``, neighbours after one another.
+    """
+    groups = [rows]
+    while len(groups[-1]) > 1:
+        halves = [half for group in groups for half in np.split(group, [(len(group) + 1) // 2])]
+        half_of = np.empty(len(rows), np.int64)
+        half_of[np.concatenate(halves)] = np.repeat(np.arange(len(halves)), [len(half) for half in halves])
+        found = half_of[codes]
+        shares = np.bincount(found) / max(1, len(found))
+        if _APART * np.mean(np.diff(found, prepend=found[:1]) != 0) >= 1 - np.square(shares).sum():
+            break
+        groups = halves
+    return groups
 
 
 def _step(rows: Float32s, wanted: float) -> float:
@@ -92,14 +126,21 @@ def _step(rows: Float32s, wanted: float) -> float:
     return lattice if 4 * lattice >= power else power
 
 
-def _integers(name: str, rows: Float32s, step: float, limit: float = 2.0**52) -> Int64s:
+def _integers(name: str, rows: Float32s, step: float, limit: float = 2.0**52) -> Integers:
     """The rows ``[N, D]`` as multiples of a step; quaternions are normalised first, unless they are multiples of it."""
-    values = np.rint(rows.astype(np.float64) / step)
-    if name == "quats" and not np.array_equal((values * step).astype(np.float32), rows):
-        values = np.rint(unit(rows).astype(np.float32).astype(np.float64) / step)
-    if not (np.abs(values) < limit).all():
-        raise ValueError(f"{name}: {np.abs(rows).max():.3g} is too large for steps of {step:.3g}; use level 'paper'")
-    return values.astype(np.int64)
+    largest = max(float(rows.max(initial=0)), -float(rows.min(initial=0)))
+    if name == "quats" and not np.array_equal(
+        (np.rint(rows.astype(np.float64) / step) * step).astype(np.float32), rows
+    ):
+        rows, largest = unit(rows).astype(np.float32), 1.0
+    if not largest / step < limit:
+        raise ValueError(f"{name}: {largest:.3g} is too large for steps of {step:.3g}; use level 'paper'")
+    # Of attributes without a codebook, there are many.
+    integers = np.empty(rows.shape, np.int32 if largest / step < SMALL else np.int64)
+    for start in range(0, len(rows), ROWS):
+        part = slice(start, start + ROWS)
+        integers[part] = np.rint(rows[part].astype(np.float64) / step)
+    return integers
 
 
 # Opacities
