@@ -19,6 +19,7 @@ FLOAT32, INT32, INT64, UINT8, UINT64 = map(np.dtype, (np.float32, np.int32, np.i
 
 # Memory that is free.
 _FREE: list[Array] = []
+_IDLE: list["Workspace"] = []
 
 
 def flat(tensor: Tensor) -> Array:
@@ -69,9 +70,6 @@ def flat_checked(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: np.dt
 def outside(name: str, numbers: Array, count: int) -> ValueError:
     """The error for row numbers some of which a kernel found outside a table of ``count`` rows."""
     return ValueError(f"{name} must be in [0, {count}), got {numbers.min()} to {numbers.max()}")
-
-
-_IDLE: list["Workspace"] = []
 
 
 class Workspace:

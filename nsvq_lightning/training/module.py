@@ -42,6 +42,12 @@ log = logging.getLogger(__name__)
 LossTerm = Callable[[Render, View], Tensor]
 
 
+def _let_go(module: LightningModule, outputs: Any, batch: View, batch_idx: int) -> None:
+    """Let go of a step's graph, after all callbacks: the next one takes its memory."""
+    if outputs:
+        outputs.clear()
+
+
 class SplatModule(LightningModule):
     """Trains 3D Gaussian splats and the codebooks that store them (NSVQ-GS).
 
@@ -319,6 +325,8 @@ class SplatModule(LightningModule):
             return {"loss": loss} if self.trainer.world_size > 1 else None
         return {"loss": loss, "render": rendered, "edits": edits, "late_loss": late_loss}
 
+    on_train_batch_end = _let_go
+
     def on_after_backward(self) -> None:
         """Look at a loss that was still on its way; of a step that must not update, drop the gradients."""
         for view, loss in self._late_losses:
@@ -326,11 +334,6 @@ class SplatModule(LightningModule):
         self._late_losses.clear()
         if not self.updates:
             self.zero_grad()
-
-    def on_train_batch_end(self, outputs: Any, batch: View, batch_idx: int) -> None:
-        """Let go of the step's graph, after all callbacks: the next one takes its memory."""
-        if outputs:
-            outputs.clear()
 
     def on_train_end(self) -> None:
         """Stop measuring the training time."""

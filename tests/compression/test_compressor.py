@@ -190,3 +190,29 @@ def test_a_limit_holds_for_the_file_that_is_saved(tmp_path: Path, share: float) 
     scene = ball(300)
     target = int(share * nl.save(nl.compress(scene, codebooks="0.5k", steps=4), tmp_path / "usual.nsvq"))
     assert nl.save(nl.compress(scene, target_bytes=target, steps=4), tmp_path / "small.nsvq") <= target
+
+
+def test_a_large_scene_is_trained_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nsvq_lightning.compression.compressor.AT_ONCE", 250)
+    scene = replace(ball(900), origin=ORIGIN)
+    before = scene.raw["shN"].copy()
+    whole = Compressor(scene, cameras_around(scene.means, 12, 80, 60), steps=8)
+    assert whole.parts == 4
+    candidate = whole.at(Setting(900, "0.5k"))
+    assert (len(candidate.scene), candidate.scene.origin) == (900, ORIGIN)
+    # Each part has codes of its own, from its k-means.
+    assert len(candidate.scene.codebooks["scales"]) > 2 * 225
+    assert len(whole.at(Setting(450, "0.5k")).scene) == 448
+    assert whole.error(candidate) < 0.05
+    np.testing.assert_array_equal(scene.raw["shN"], before)
+    # Photos are of the whole.
+    photos = replace(own_scene(scene.tensors(), whole.cameras), split="of a folder")
+    assert Compressor(scene, (), photos).parts == 1
+
+
+def test_bytes_are_kept_to_in_parts_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nsvq_lightning.compression.compressor.AT_ONCE", 250)
+    scene = ball(900)
+    whole = Compressor(scene, cameras_around(scene.means, 12, 80, 60), steps=4)
+    target = int(0.9 * len(whole.at(Setting(900, "0.5k")).data))
+    assert len(whole.finest_within(target, 900).data) <= target

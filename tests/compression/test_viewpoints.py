@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nsvq_lightning.compression.viewpoints import Measure, likely_cameras, own_scene
+from nsvq_lightning.compression.viewpoints import Measure, likely_cameras, own_scene, showing, spread
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats
@@ -78,3 +78,17 @@ def test_an_error_is_the_root_mean_square_difference_of_pictures() -> None:
     assert measure.error(other) == pytest.approx(expected, rel=1e-5)
     with pytest.raises(ValueError, match="all 1 pictures of the scene are black"):
         Measure(painting()._replace(means=painting().means + 1e4), cameras[:1])
+
+
+def test_cameras_of_a_part_are_those_that_show_it() -> None:
+    cameras = likely_cameras(painting(), 6, 64, 48)
+    means = painting().means.numpy()
+    assert len(showing(cameras, means, 4)) == 4
+    assert len(showing(cameras, means + 1000, 6)) < 3 < len(showing(cameras, means, 6))
+    assert showing([], means, 4) == []
+
+
+def test_some_rows_are_spread_over_all() -> None:
+    assert spread(range(10), 4) == range(0, 10, 3)
+    assert spread((), 4) == ()
+    assert spread([1, 2], 4) == [1, 2]

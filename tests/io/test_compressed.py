@@ -77,3 +77,19 @@ def test_coefficients_that_are_left_out_count_as_zero() -> None:
     expected = np.sqrt(np.mean(arrays["shN"].astype(float) ** 2))
     assert attribute_errors(flat, scene)["shN"] == pytest.approx(expected)
     assert attribute_errors(plain_scene(0), plain_scene(0))["position"] == 0
+
+
+def test_parts_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, other = coded(50), coded(50, metrics={})
+    other = replace(other, means=other.means + 1)
+    turned = scene.changed({name: lambda rows: 2.0 * rows[:, ::-1] for name in ("shN", "sh0")})
+    errors = attribute_errors(other, scene)
+    monkeypatch.setattr("nsvq_lightning.io.compressed.ROWS", 7)
+    parts = [*scene.parts()]
+    assert [len(part) for part in parts] == [7] * 7 + [1]
+    np.testing.assert_array_equal(np.concatenate([part.rows("shN") for part in parts]), scene.rows("shN"))
+    again = scene.changed({name: lambda rows: 2.0 * rows[:, ::-1] for name in ("shN", "sh0")})
+    for name in ("shN", "sh0"):
+        np.testing.assert_array_equal(again.rows(name), turned.rows(name))
+    assert attribute_errors(other, scene) == pytest.approx(errors)
+    assert scene.in_order(np.arange(50)) is scene

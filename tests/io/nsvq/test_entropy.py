@@ -125,3 +125,15 @@ def test_altered_bytes_never_lead_out_of_the_arrays(seed: int) -> None:
             assert attempt()
         except FormatError:
             continue
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.int64])
+def test_an_order_of_rows_is_as_good_as_the_rows_in_that_order(dtype: type[np.signedinteger]) -> None:
+    rng = np.random.default_rng(3)
+    values = np.cumsum(rng.integers(-9, 9, (300, 3)), axis=0).astype(dtype)
+    order = rng.permutation(300)
+    assert encode_integers(values, order) == encode_integers(values[order].astype(np.int64))
+    with pytest.raises(ValueError, match="order must be in"):
+        encode_integers(values, order + 1)
+    with pytest.raises(TypeError, match="values must be int64"):
+        encode_integers(values.astype(np.int16))
