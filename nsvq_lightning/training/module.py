@@ -42,12 +42,6 @@ log = logging.getLogger(__name__)
 LossTerm = Callable[[Render, View], Tensor]
 
 
-def _let_go(module: LightningModule, outputs: Any, batch: View, batch_idx: int) -> None:
-    """Let go of a step's graph, after all callbacks: the next one takes its memory."""
-    if outputs:
-        outputs.clear()
-
-
 class SplatModule(LightningModule):
     """Trains 3D Gaussian splats and the codebooks that store them (NSVQ-GS).
 
@@ -324,8 +318,6 @@ class SplatModule(LightningModule):
             self.zero_grad()
             return {"loss": loss} if self.trainer.world_size > 1 else None
         return {"loss": loss, "render": rendered, "edits": edits, "late_loss": late_loss}
-
-    on_train_batch_end = _let_go
 
     def on_after_backward(self) -> None:
         """Look at a loss that was still on its way; of a step that must not update, drop the gradients."""

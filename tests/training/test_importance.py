@@ -10,6 +10,8 @@ from splat_scenes import front_camera, random_splats
 from torch import Tensor
 
 from nsvq_lightning.compression.viewpoints import look_at
+from nsvq_lightning.compute import memory
+from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
@@ -151,3 +153,9 @@ def test_a_mask_hides_what_it_excludes() -> None:
     mask = torch.zeros(48, 64, dtype=torch.bool)
     removed = floaters(own, lambda: [View("0", 0, camera, photo * mask[..., None], mask)], render)
     assert removed.all()
+
+
+def test_each_view_takes_the_memory_of_the_one_before() -> None:
+    memory.trim()
+    contributions(random_splats(50), [front_camera()] * 3, rendered)
+    assert len(memory._IDLE) == (kernels_for(torch.zeros(1)) == "cpu")

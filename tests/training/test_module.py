@@ -10,18 +10,14 @@ from lightning.pytorch import Trainer
 from torch import Tensor, nn
 
 from nsvq_lightning.callbacks import PhaseSchedule
-from nsvq_lightning.compression.viewpoints import own_scene
-from nsvq_lightning.compute import memory
-from nsvq_lightning.data.datamodule import SceneDataModule
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.splats.attributes import ATTRIBUTES
-from nsvq_lightning.splats.splats import RawSplats, Splats, detached
+from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
-from nsvq_lightning.training.trainer import SplatTrainer
 
 CODES = {"scales": 6, "quats": 5, "sh0": 4, "shN": 3}
 
@@ -186,12 +182,3 @@ def test_trained_splats_are_rendered_with_all_their_coefficients() -> None:
     splats = Splats.from_points(torch.randn(5, 3), torch.rand(5, 3), 2)
     assert SplatModule(splats=splats).active_sh_degree == 2
     assert SplatModule(sh_degree=2).active_sh_degree == 0  # from points, the degree grows
-
-
-def test_a_step_takes_the_memory_of_the_one_before() -> None:
-    splats = make_splats()
-    scene = own_scene(detached(splats), [camera() for _ in range(4)])
-    module = SplatModule(splats=splats, codebooks=None)
-    memory.trim()
-    SplatTrainer(max_steps=5, enable_checkpointing=False).fit(module, SceneDataModule(scene))
-    assert len(memory._IDLE) == 2  # of the renderer and of the loss
