@@ -377,14 +377,20 @@ def attribute_errors(read: CompressedScene, written: CompressedScene) -> dict[st
     return {name: math.sqrt(total) for name, total in sums.items()}
 
 
-def _differences(read: CompressedScene, written: CompressedScene) -> dict[str, Float64s]:
+def _differences(read: CompressedScene, written: CompressedScene) -> dict[str, Arrays]:
     """Differences ``[N, ...]`` of the same splats, as :func:`attribute_errors` names them."""
     units = unit(read.rows("quats"))
     others = unit(written.rows("quats"))
     nearer = np.minimum(np.linalg.norm(units - others, axis=1), np.linalg.norm(units + others, axis=1))
-    named = {"position": "means", "log-scale": "scales", "sh0": "sh0", "shN": "shN"}
+
+    def difference(name: str) -> Arrays:
+        return read.rows(name) - written.rows(name).astype(np.float64)
+
     return {
+        "position": difference("means"),
         "rotation": np.degrees(4 * np.arcsin(np.minimum(nearer / 2, 1))),
+        "log-scale": difference("scales"),
         "opacity": opacity_of(read.opacities) - opacity_of(written.opacities),
-        **{quantity: read.rows(name) - written.rows(name).astype(np.float64) for quantity, name in named.items()},
+        "sh0": difference("sh0"),
+        "shN": difference("shN"),
     }

@@ -105,7 +105,7 @@ def test_keyframes_are_followed(scene: Path, demo_scene: Path, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--path", "cameras"], "--path cameras needs the cameras of photos"),
+        (["--path", "cameras"], "--path cameras needs cameras of photos"),
         (["--path", "gone.json"], "gone.json"),
         (["-o", "a.avi"], "a.avi: name a video (.mp4), or a folder"),
         (["--data.root", "nowhere"], "nowhere"),
