@@ -260,11 +260,9 @@ def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -
     Raises:
         SceneError: The folder is not a scene.
     """
-    from nsvq_lightning.compression.viewpoints import likely_cameras, spread
+    from nsvq_lightning.compression.viewpoints import spread, square_views
 
     cameras, photos = known_views(path, root, splats.means.detach().cpu().numpy())
     if photos is not None:
         return [photos.cameras[index] for index in photos.some_train(most)]
-    if not cameras:
-        return likely_cameras(splats, most, 640, 640, degrees=50)
-    return list(spread(list(cameras.values()), most))
+    return list(spread(list(cameras.values()), most)) or square_views(splats, most)

@@ -23,10 +23,10 @@ from nsvq_lightning.compression.viewpoints import (
     VIEWS,
     Measure,
     check_cameras,
-    likely_cameras,
     own_scene,
     showing,
     spread,
+    square_views,
 )
 from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.compute.memory import trim
@@ -186,8 +186,7 @@ class Compressor:
         known = [self.photos.cameras[index] for index in self.photos.train] if self.photos else self.cameras
         self._known = tuple(known)
         if not self.cameras:
-            # Square pictures with the pixels of a photo: what a wide one shows at its edges, photos seldom do.
-            self.cameras = known or likely_cameras(self._splats, VIEWS, 640, 640, degrees=50)
+            self.cameras = known or square_views(self._splats, VIEWS)
         self.cameras = spread(self.cameras, VIEWS)
         self._is_own = self.photos is None or self.photos.split == OWN
         if not self._is_own and (likeness := self._psnr(self._splats)) < MIN_PSNR:

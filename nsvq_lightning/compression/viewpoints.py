@@ -232,6 +232,11 @@ def likely_cameras(
     return [look_at(targets[k], eyes[k], width, height, angle) for k in best]
 
 
+def square_views(splats: SplatTensors, most: int) -> list[Camera]:
+    """Likely cameras with the pixels of a photo, square: what a wide picture shows at its edges, photos seldom do."""
+    return likely_cameras(splats, most, 640, 640, degrees=50)
+
+
 @torch.no_grad()
 def _detail(splats: SplatTensors, camera: Camera) -> float:
     """Mean difference between neighbouring pixels, times the share of the picture that is covered."""

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# Splats of a part.
-ROWS = 1 << 16
+ROWS = splat.ROWS
 
 
 @dataclass(frozen=True, eq=False)

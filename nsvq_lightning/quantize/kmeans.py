@@ -125,9 +125,9 @@ def kmeans(
     if weight is not None:
         if weight.shape != x.shape[:1] or not (weight >= 0).all() or not (weight > 0).any():
             raise ValueError(f"weight must have shape [{x.shape[0]}], no negative and at least one positive value")
-        weight = weight.double()
-        if not (weight > 0).all():
-            x, weight = x[weight > 0], weight[weight > 0]
+        used, weight = weight > 0, weight.double()
+        if not used.all():
+            x, weight = x[used], weight[used]
     if start is None:
         first = distinct_rows(x)
         distinct = x[first] if len(first) < len(x) else x

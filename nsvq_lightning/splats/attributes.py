@@ -86,8 +86,8 @@ def attribute_dims(sh_degree: int) -> dict[str, int]:
     return {name: math.prod(shape) for name, shape in attribute_shapes(sh_degree).items()}
 
 
-# Rows of a tensor that are searched at once.
-_ROWS = 1 << 16
+# Splats of a part, where what is made of one part at a time takes little memory.
+ROWS = 1 << 16
 
 
 def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int]]:
@@ -106,7 +106,7 @@ def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int
             masks[name] = np.isfinite(rows).all(1)
         else:  # torch makes a copy on the way
             masks[name] = rows.new_ones(len(rows)).bool()
-            for mask, part in zip(masks[name].split(_ROWS), rows.split(_ROWS), strict=True):
+            for mask, part in zip(masks[name].split(ROWS), rows.split(ROWS), strict=True):
                 mask.copy_(part.isfinite().all(1))
     culprits = {name: len(mask) - int(mask.sum()) for name, mask in masks.items() if not mask.all()}
     return reduce(and_, masks.values()), culprits
