@@ -116,11 +116,9 @@ def check_machine() -> Iterator[Finding]:
 
     machine, versions = timing.describe_machine()
     if torch.cuda.is_available() or torch.backends.mps.is_available():
-        advice = "runs use the CPU, as its GPU has no kernels here (NVIDIA's on Linux have)"
-    elif torch.version.cuda or torch.version.hip:
-        advice = "torch finds no GPU: check nvidia-smi and CUDA_VISIBLE_DEVICES"
+        advice = "runs use the CPU, as its GPU has no kernels here (NVIDIA's have, on Linux with Triton 3.4 or later)"
     else:
-        advice = "torch finds no GPU: for an NVIDIA GPU install a CUDA build"
+        advice = "torch finds no GPU: one of NVIDIA needs a CUDA build, and must be seen by nvidia-smi"
     yield judged("machine", machine, advice, when=best_device().type == "cpu")
     yield Finding("good", "versions", versions)
 

@@ -9,6 +9,7 @@ import importlib.util
 import logging
 import os
 from functools import cache
+from pathlib import Path
 from typing import Literal
 
 import torch
@@ -42,7 +43,11 @@ def best_device() -> torch.device:
 
     Lightning's own choice may be one without any, Apple's MPS or, on Windows, CUDA: plain torch is slower than the CPU.
     """
-    return torch.device("cuda" if torch.cuda.is_available() and _has_triton() else "cpu")
+    if torch.cuda.is_available():
+        if _has_triton():
+            return torch.device("cuda")
+        log.warning(f"the CPU is used and not the CUDA device: {NEEDS_TRITON}")
+    return torch.device("cpu")
 
 
 def devices_with_kernels() -> list[str]:
@@ -83,15 +88,19 @@ def _obstacle(kernels: str, like: Tensor) -> str | None:
         if not torch.cuda.is_available():
             help_ = "torch finds no CUDA device here (nsvq doctor says why)"
         return f"it renders float32 tensors on a CUDA device, {got}; {help_}"
-    if _has_triton():
-        return None
-    return "it needs Triton, which comes with CUDA builds of PyTorch for Linux (pip install triton)"
+    return None if _has_triton() else NEEDS_TRITON
+
+
+NEEDS_TRITON = "it needs Triton 3.4 or later, which CUDA builds of PyTorch 2.8 for Linux bring (pip install -U torch)"
 
 
 @cache
 def _has_triton() -> bool:
-    """Whether Triton is installed; a render with ``backend="cuda"`` asks each time."""
-    return importlib.util.find_spec("triton") is not None
+    """Whether a Triton that can compile the kernels is installed; a render with ``backend="cuda"`` asks each time."""
+    triton = importlib.util.find_spec("triton")
+    folders = (triton and triton.submodule_search_locations) or ()
+    # Before 3.4, without this file, it has no tuples of tuples.
+    return any(Path(folder, "knobs.py").is_file() for folder in folders)
 
 
 # Names that ``render(backend=...)`` takes; ``auto`` is this package's fastest one for the device of the splats.

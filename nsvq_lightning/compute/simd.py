@@ -258,28 +258,15 @@ def maximum(builder, x, y):
     return builder.select(builder.fcmp_ordered(">", x, y), x, y)
 
 
-@_function(Lanes, Lanes)
-def sqrt(builder, x):
-    """Square root; NaN below zero."""
-    return _llvm(builder, "sqrt.v16f32", [x])
+def _of_llvm(name):
+    """A function that LLVM has for numbers and vectors."""
+    return _function(Lanes, Lanes)(lambda builder, x: _llvm(builder, f"{name}.v16f32", [x]))
 
 
-@_function(Lanes, Lanes)
-def floor(builder, x):
-    """Largest integer not above."""
-    return _llvm(builder, "floor.v16f32", [x])
-
-
-@_function(Lanes, Lanes)
-def ceil(builder, x):
-    """Smallest integer not below."""
-    return _llvm(builder, "ceil.v16f32", [x])
-
-
-@_function(Lanes, Lanes)
-def abs(builder, x):
-    """Absolute value."""
-    return _llvm(builder, "fabs.v16f32", [x])
+sqrt = _of_llvm("sqrt")  # NaN below zero
+floor = _of_llvm("floor")
+ceil = _of_llvm("ceil")
+abs = _of_llvm("fabs")
 
 
 @_function(Lanes, Mask, Lanes, Lanes)

@@ -155,20 +155,20 @@ def pixel_range(centre, half, size):
 
 
 @inline
-def nearer(point, sampling):
-    """How many times as near as in training a splat is, squared; below 1 where it is farther, 1 where it is neither."""
+def trained_distance(point, sampling):
+    """The nearest distance of training to that of a splat, and that of the splat, both squared."""
     nearest, farthest, _ = sampling
     squared = dot3(point, point)
     nearest, farthest = nearest * nearest, farthest * farthest
-    outside = simd.where(squared < nearest, nearest, simd.where(squared > farthest, farthest, squared))
-    return simd.minimum(outside / squared, MAX_RATIO)
+    return simd.where(squared < nearest, nearest, simd.where(squared > farthest, farthest, squared)), squared
 
 
 @inline
 def sampling_ratio(point, sampling):
     """r²: pixels per unit of world at a splat, relative to training, squared."""
     _, _, size = sampling
-    return size * nearer(point, sampling)
+    trained, now = trained_distance(point, sampling)
+    return size * simd.minimum(trained / now, MAX_RATIO)
 
 
 @inline
@@ -437,9 +437,9 @@ def geometry_backward(view, point, quat, log_scales, factor, moments, h, centre,
         trace = simd.fma(uu, a * a, uu * (b * b)) + simd.fma(2 * uv, b * c, vv * (c * c))
         by_ratio = simd.where(ratio > 1, 0.5 * BLUR * trace, by_ratio)
         # Outside the distances of training, r² falls with the square of the distance.
-        times_nearer = nearer(point, sampling)
-        constant = (times_nearer >= 1) & (times_nearer <= 1) | (times_nearer >= MAX_RATIO)
-        per_distance = simd.where(constant, 0.0, -2 * by_ratio * ratio / dot3(point, point))
+        trained, now = trained_distance(point, sampling)
+        moved = (trained < now) | (trained > now) & (trained < MAX_RATIO * now)  # x / x need not be 1 on a GPU
+        per_distance = simd.where(moved, -2 * by_ratio * ratio / now, 0.0)
         rotation, _, _, _, _ = view
         g_mean = add3(g_mean, times(columns(rotation), scale3(per_distance, point)))
     return g_mean, g_quat, g_scale

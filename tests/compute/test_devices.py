@@ -1,6 +1,8 @@
 """Which device trains, and copies that nobody waits for; what a GPU does is played by a stand-in."""
 
+import sys
 from contextlib import nullcontext
+from pathlib import Path
 
 import pytest
 import torch
@@ -60,13 +62,26 @@ def test_a_number_of_a_gpu_is_read_after_its_own_copy() -> None:
     [(True, True, "cuda"), (True, False, "cpu"), (False, True, "cpu"), (False, False, "cpu")],
 )
 def test_the_best_device_is_one_with_kernels(
-    monkeypatch: pytest.MonkeyPatch, cuda: bool, triton: bool, best: str
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, cuda: bool, triton: bool, best: str
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     monkeypatch.setattr(devices, "_has_triton", lambda: triton)
     assert best_device() == torch.device(best)
     assert devices_with_kernels() == list(dict.fromkeys(["cpu", best]))
+    assert ("Triton 3.4 or later" in caplog.text) == (cuda and not triton)
+
+
+@pytest.mark.parametrize(("files", "enough"), [(["__init__"], False), (["__init__", "knobs"], True)])
+def test_a_triton_that_cannot_compile_the_kernels_is_none(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, files: list[str], enough: bool
+) -> None:
+    (tmp_path / "triton").mkdir()
+    for name in files:
+        (tmp_path / "triton" / f"{name}.py").touch()
+    monkeypatch.delitem(sys.modules, "triton", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert devices._has_triton.__wrapped__() == enough
 
 
 @pytest.mark.parametrize(

@@ -51,12 +51,9 @@ def load_geometry(means, quats, scales, row, mask):
 
 @triton.jit
 def load_sampling(distances, size, row, n, mask):
-    """The sampling of the rows, whose ``distances`` are ``[2, n]``; None stays None."""
-    if distances is None:
-        return None
-    else:
-        nearest = tl.load(distances + row, mask=mask, other=1.0)
-        return nearest, tl.load(distances + n + row, mask=mask, other=1.0), size
+    """The sampling of the rows, whose ``distances`` are ``[2, n]``."""
+    nearest = tl.load(distances + row, mask=mask, other=1.0)
+    return nearest, tl.load(distances + n + row, mask=mask, other=1.0), size
 
 
 # Passed as the SH degree where no record is wanted.
@@ -76,7 +73,9 @@ def project_kernel(
     camera = load_view(view, fx, fy)
     screen = (cx, cy, width, height, tl.load(view + NEAR))
     point = formulas.view_point(camera, mean)
-    trained_at = load_sampling(distances, size, row, n, inside)
+    trained_at = None  # Triton before 3.7 cannot return it
+    if distances is not None:
+        trained_at = load_sampling(distances, size, row, n, inside)
     seen, record, first, last, radius = formulas.footprint(camera, screen, point, quat, scale, logit, trained_at)
     seen = inside & seen
     radius = tl.minimum(radius, 1e9)
@@ -113,10 +112,13 @@ def project_backward_kernel(
     total, record = totals + rank * rec.RECORD, records + rank * rec.RECORD
     centre = load_row(g_means2d + 2 * row, 2, seen)
     h = tl.load(total + rec.SUM_H, mask=seen, other=0.0)
+    trained_at = None
+    if distances is not None:
+        trained_at = load_sampling(distances, size, row, n, seen)
     g_mean, g_quat, g_scale = formulas.geometry_backward(
         camera, (x, y, tl.where(seen, z, 1.0)), quat, scale, load_row(record + rec.A, 3, seen),
         load_row(total + rec.SUM_UU, 3, seen), h, centre, tl.load(total + rec.SUM_DEPTH, mask=seen, other=0.0),
-        load_sampling(distances, size, row, n, seen),
+        trained_at,
     )  # fmt: skip
     store_row(g_scales + 3 * row, g_scale, inside)
     store_row(g_quats + 4 * row, g_quat, inside)
