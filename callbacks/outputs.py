@@ -144,8 +144,8 @@ class LiveScene(WritingCallback):
                 state["psnr"] = f"{module.history[-1]['psnr']:.2f}"
             scene = CompressedScene.from_splats(splats, config={"antialiased": module.antialiased, "live": state})
             scene = replace(placed(scene, module.frame), cameras=module.cameras)
-            with optional(folder / viewer.LIVE_SCENE):
-                save(scene, folder / viewer.LIVE_SCENE, Storage("paper"))
+            with optional(folder / viewer.LIVE_SCENE) as path:
+                save(scene, path, Storage("paper"))
         self._answered, ended = asked, time.monotonic()
         self._next = ended + (ended - began) / SHARE
 

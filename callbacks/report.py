@@ -119,10 +119,10 @@ class MetricReport(WritingCallback):
         folder = run_folder(trainer)
         if trainer.is_global_zero and module.history and not is_fast_dev_run(trainer):
             with module.stopwatch.paused(module.device):
-                with optional(folder / "curve.csv"):
-                    numbers.write_csv(folder / "curve.csv", module.history)
-                with optional(folder / "curve.png"):
-                    pictures.write_figure(folder / "curve.png", pictures.curve_figure(module.history, module.schedule))
+                with optional(folder / "curve.csv") as path:
+                    numbers.write_csv(path, module.history)
+                with optional(folder / "curve.png") as path:
+                    pictures.write_figure(path, pictures.curve_figure(module.history, module.schedule))
 
     def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Catch up for a run that was stopped after its last iteration: when continued, it trains no further."""
@@ -148,8 +148,8 @@ class MetricReport(WritingCallback):
 
         def show(image: Tensor, photo: Tensor) -> None:
             if self.pictures and trainer.is_global_zero:
-                with optional(folder / "preview.png"):
-                    pictures.write_png(folder / "preview.png", torch.cat([eight_bit(photo), image], dim=1))
+                with optional(folder / "preview.png") as path:
+                    pictures.write_png(path, torch.cat([eight_bit(photo), image], dim=1))
 
         mean_psnr, mean_ssim = numbers.evaluate(module.scene.render, splats, views, show)
         entry: dict[str, Any] = {
@@ -162,8 +162,8 @@ class MetricReport(WritingCallback):
         }
         module.history.append(entry)
         if trainer.is_global_zero:
-            with optional(folder / "curve.csv"):
-                numbers.write_csv(folder / "curve.csv", module.history)
+            with optional(folder / "curve.csv") as path:
+                numbers.write_csv(path, module.history)
             with optional(folder / page.NAME):
                 page.write_page(folder, module.history, module.schedule, self._beside.seconds())
         values = {f"report/{name}": float(entry[name]) for name in ("psnr", "ssim", "splats")}
@@ -233,10 +233,10 @@ class MetricReport(WritingCallback):
             folder = run_folder(trainer)
             lpips = None if self._lpips is None else fmean(score["lpips"] for score in scores), self._lpips_reason
             metrics = numbers.summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper)
-            with optional(folder / "metrics.json"):
-                numbers.write_metrics(folder / "metrics.json", metrics)
-            with optional(folder / "views.csv"):
-                numbers.write_csv(folder / "views.csv", scores)
+            with optional(folder / "metrics.json") as path:
+                numbers.write_metrics(path, metrics)
+            with optional(folder / "views.csv") as path:
+                numbers.write_csv(path, scores)
             paths = [picture_file(trainer, folder / "renders", score["name"]) for score in scores]
             views = [score | {"picture": path.name} for score, path in zip(scores, paths, strict=True)]
             with optional(folder / page.NAME):

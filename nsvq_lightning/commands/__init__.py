@@ -1,7 +1,7 @@
 """The commands that may follow ``nsvq``. Light: it imports no heavy modules."""
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from difflib import get_close_matches
 
 # What each command does. It is the module of its name that does it, see
@@ -57,3 +57,13 @@ def nearest(word: str, known: Iterable[str]) -> str:
 def say(*lines: str) -> None:
     """Write lines to standard output."""
     sys.stdout.writelines(f"{line}\n" for line in lines)
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: Collection[str]) -> str:
+    """A Markdown table that also reads well as plain text; columns named in ``words`` align left, numbers right."""
+    columns = []
+    for name, *cells in zip(head, *rows, strict=True):
+        width = max(3, *map(len, (name, *cells)))
+        aligned, end = (str.ljust, "-") if name in words else (str.rjust, ":")
+        columns.append([aligned(cell, width) for cell in (name, aligned(end, width, "-"), *cells)])
+    return "\n".join(f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))

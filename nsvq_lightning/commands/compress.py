@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     help_ = "steps of a training; 500, or 1500 with fewer splats, if they fit into --minutes"
     add("--steps", type=positive(int), metavar="N", help=help_)
     help_ = "what one training may take, about; %(default)g by default"
-    add("--minutes", type=positive(float), default=4.0, metavar="M", help=help_)
+    add("--minutes", type=positive(float), default=2.0, metavar="M", help=help_)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -35,7 +35,7 @@ class RunLogger(loggers.CSVLogger):
 
     def save(self) -> None:
         """Write what has been logged; what cannot be written now is written later."""
-        with optional(self.log_dir):
+        with optional(Path(self.log_dir)):
             super().save()
 
 
@@ -85,8 +85,8 @@ class RunStart(SaveConfigCallback):
             self._write(run_folder(trainer))
 
     def _write(self, folder: Path) -> None:
-        with optional(folder / self.config_filename):
-            write_text(folder / self.config_filename, self.parser.dump(self.config, skip_none=False))
+        with optional(folder / self.config_filename) as path:
+            write_text(path, self.parser.dump(self.config, skip_none=False))
 
 
 PARSER_SETTINGS: dict[str, Any] = {name: {"description": COMMANDS[name]} for name in OF_LIGHTNING}

@@ -2,12 +2,10 @@
 
 import argparse
 import json
-from collections.abc import Iterable
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from nsvq_lightning.commands import say
+from nsvq_lightning.commands import markdown_table, say
 from nsvq_lightning.commands.arguments import folders_beside
 from nsvq_lightning.io.formats import describe
 
@@ -25,6 +23,8 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
+# Columns of a table that hold words.
+WORDS = ("attribute", "stream", "storage", "encoding")
 # What may have the cameras of a scene file: of INRIA's trainer, of COLMAP or of nerfstudio.
 CAMERA_FILES = ("cameras.json", "sparse", "transforms.json", "transforms_train.json")
 
@@ -48,35 +48,21 @@ def _text(facts: dict[str, Any]) -> str:
         rows += [("cameras", f"not in the file, but maybe in {place}") for place in places if place.exists()][:1]
     parts = ["\n".join(f"{name:<11} {value}" for name, value in rows)]
     if "attributes" in facts:
-        entries = map(itemgetter("name", "storage", "dim", "codes", "bits"), facts["attributes"])
-        parts.append(_table(("attribute", "storage", "D", "K", "bits"), entries))
+        entries = []
+        for entry in facts["attributes"]:
+            counts = (f"{entry[name]:,}" if entry[name] else "-" for name in ("dim", "codes", "bits"))
+            entries.append((entry["name"], entry["storage"], *counts))
+        parts.append(markdown_table(("attribute", "storage", "D", "K", "bits"), entries, WORDS))
     if "streams" in facts:
         streams = []
         for stream in facts["streams"]:
             count = stream["bytes"]
-            each = f"{8 * count / splats:.2f}", f"{100 * count / size:.1f} %"
-            streams.append((stream["name"], stream["encoding"], count, *each))
-        parts.append(_table(("stream", "encoding", "bytes", "bits per splat", "share"), streams))
+            each = f"{count:,}", f"{8 * count / splats:.2f}", f"{100 * count / size:.1f} %"
+            streams.append((stream["name"], stream["encoding"], *each))
+        parts.append(markdown_table(("stream", "encoding", "bytes", "bits per splat", "share"), streams, WORDS))
     for key in ("metrics", "config"):
         if facts.get(key):
             # Without the outer braces; the lines between them are already indented by two.
             lines = json.dumps(facts[key], indent=2, ensure_ascii=False).splitlines()[1:-1]
             parts.append("\n".join([key, *lines]))
     return "\n\n".join(parts)
-
-
-def _table(head: tuple[str, ...], rows: Iterable[tuple[str | int, ...]]) -> str:
-    """A table of two columns of words, then columns of numbers."""
-    columns = []
-    for number, column in enumerate(zip(head, *rows, strict=True)):
-        cells = list(map(_cell, column))
-        width = max(map(len, cells))
-        columns.append([cell.ljust(width) if number < 2 else cell.rjust(width) for cell in cells])
-    return "\n".join("  ".join(line).rstrip() for line in zip(*columns, strict=True))
-
-
-def _cell(value: str | int) -> str:
-    """A word as it is, a number with commas, and 0 as a dash."""
-    if isinstance(value, str):
-        return value
-    return f"{value:,}" if value else "-"

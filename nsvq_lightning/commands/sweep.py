@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nsvq_lightning.commands import say
+from nsvq_lightning.commands import markdown_table, say
 from nsvq_lightning.commands.arguments import integers, names
 from nsvq_lightning.commands.settings import expand
 from nsvq_lightning.io.atomic import write_text
@@ -366,7 +366,7 @@ def write_results(output: Path, rows: Sequence[Row]) -> None:
                 text += f" ± {spread:{form}}"
             line.append(text)
         lines.append(line)
-    text = f"# nsvq sweep\n\n{numbers.markdown_table([*NAMES, 'runs', *TABLE], lines, words=NAMES)}\n\n"
+    text = f"# nsvq sweep\n\n{markdown_table([*NAMES, 'runs', *TABLE], lines, words=NAMES)}\n\n"
     text += "Mean ± standard deviation over the seeds. PSNR (dB) and SSIM are of the decoded file on the test views, "
     text += "psnr_before of the plain splats.\n"
     if failed:

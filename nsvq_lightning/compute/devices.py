@@ -157,24 +157,22 @@ class AsyncScalar:
     ``tensor.item()`` waits until a GPU has done all its work, and the GPU then waits for the next launch. Here the copy
     starts at once, and :meth:`read` waits for that copy alone.
 
+    Attributes:
+        is_here: Whether the number was on the host from the start, so that nobody ever waits for it.
+
     Args:
         value: Scalar tensor on any device.
     """
 
     def __init__(self, value: Tensor) -> None:
-        self._host, self._copied = value.detach(), None
-        if value.is_cuda:
+        self._host, self.is_here = value.detach(), not value.is_cuda
+        if not self.is_here:
             self._host = torch.empty((), dtype=value.dtype, pin_memory=True)
             self._host.copy_(value.detach(), non_blocking=True)
             self._copied = torch.cuda.current_stream(value.device).record_event()
 
-    @property
-    def is_here(self) -> bool:
-        """Whether the number was on the host from the start, so that nobody ever waits for it."""
-        return self._copied is None
-
     def read(self) -> float:
         """The number."""
-        if self._copied is not None:
+        if not self.is_here:
             self._copied.synchronize()
         return float(self._host)

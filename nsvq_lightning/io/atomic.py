@@ -78,13 +78,13 @@ def write_text(path: StrPath, text: str) -> None:
 
 
 @contextmanager
-def optional(path: StrPath) -> Iterator[None]:
+def optional(path: Path) -> Iterator[Path]:
     """Warn if what the block writes to ``path`` cannot be written, and go on: for what a run can do without.
 
     A program may hold the file open, as Windows lets it, or the disk be full.
     """
     try:
-        yield
+        yield path
     except OSError as error:
         log.warning("%s cannot be written (%s); the run goes on without it", path, error.strerror or error)
 

@@ -354,20 +354,12 @@ def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, 
     chunk = header.others["chunk"]
     chunks = _table(path, chunk)
     vertices = _table(path, header)
-    shares = {name: _unpacked(vertices[name], *places) for name, places in _PACKED.items()}
-    largest = (vertices["packed_rotation"] >> 30).astype(np.intp)
-    rows: dict[str, Arrays] = {
-        "means": shares["packed_position"],
-        "scales": shares["packed_scale"],
-        "sh0": shares["packed_color"][:, :3],
-        "opacities": logits_of(shares["packed_color"][:, 3]),
-        "quats": conventions.from_smallest_three(largest, (shares["packed_rotation"] - 0.5) * math.sqrt(2)),
-    }
     bounds = np.stack([chunks[name] for name in _bounds(chunk)], axis=1)
-    ends = np.split(_for_each(bounds, header.count), bounds.shape[1] // 3, axis=1)
-    for part, low, high in zip(rows.values(), ends[::2], ends[1::2], strict=False):
-        part[:] = low * (1 - part) + high * part
-    rows["sh0"] = (rows["sh0"] - 0.5) / SH_C0
+    rows = {name: np.empty((header.count, dim), np.float32) for name, dim in attribute_dims(0).items()}
+    for start in range(0, header.count, _ROWS):
+        several = slice(start, start + _ROWS)
+        for name, part in _of_chunks(vertices[several], bounds[start // _CHUNK :]).items():
+            rows[name][several] = part
     if sh_degree:
         levels = _table(path, header.others["sh"])
         # Bytes stand for the middles of 256ths, the first and the last for the ends.
@@ -379,6 +371,23 @@ def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, 
     return rows
 
 
+def _of_chunks(vertices: NDArray[np.void], bounds: Float32s) -> dict[str, Float64s]:
+    """Rows ``[N, D]`` of each attribute of packed splats, which begin with a chunk."""
+    shares = {name: _unpacked(vertices[name], *places) for name, places in _PACKED.items()}
+    largest = (vertices["packed_rotation"] >> 30).astype(np.intp)
+    rows: dict[str, Arrays] = {
+        "means": shares["packed_position"],
+        "scales": shares["packed_scale"],
+        "sh0": shares["packed_color"][:, :3],
+        "opacities": logits_of(shares["packed_color"][:, 3:]),
+        "quats": conventions.from_smallest_three(largest, (shares["packed_rotation"] - 0.5) * math.sqrt(2)),
+    }
+    ends = np.split(_for_each(bounds, len(vertices)), bounds.shape[1] // 3, axis=1)
+    for part, low, high in zip(rows.values(), ends[::2], ends[1::2], strict=False):
+        part[:] = low * (1 - part) + high * part
+    return rows | {"sh0": (rows["sh0"] - 0.5) / SH_C0}
+
+
 def _table(path: StrPath, header: PlyHeader) -> NDArray[np.void]:
     """The rows of an element of a binary file."""
     return np.fromfile(path, header.dtype, header.count, offset=header.offset)
@@ -386,7 +395,7 @@ def _table(path: StrPath, header: PlyHeader) -> NDArray[np.void]:
 
 def _for_each(bounds: Float32s, count: int) -> Float64s:
     """The bounds ``[N, ...]`` of each splat from those of chunks."""
-    return bounds.repeat(_CHUNK, axis=0)[:count].astype(np.float64)
+    return bounds[: -(-count // _CHUNK)].repeat(_CHUNK, axis=0)[:count].astype(np.float64)
 
 
 def _unpacked(words: Uint32s, lowest: Sequence[int], largest: Sequence[int]) -> Float64s:

@@ -394,9 +394,9 @@ def read_spz(path: StrPath) -> CompressedScene:
         {
             "means": _unpacked_means(header, arrays["means"]) * xyz,
             "quats": _unpacked_quats(header, arrays["quats"]) * quats,
-            "scales": arrays["scales"] / 16 - 10,
+            "scales": arrays["scales"].astype(np.float32) / 16 - 10,
             "opacities": logits_of_bytes(arrays["opacities"]),
-            "sh0": (arrays["sh0"] / 255 - 0.5) / _COLOR,
+            "sh0": ((np.arange(256) / 255 - 0.5) / _COLOR).astype(np.float32)[arrays["sh0"]],
             "shN": _unpacked_harmonics(arrays["shN"], harmonics),
         },
         antialiased=bool(header.flags & ANTIALIASED),
@@ -411,7 +411,7 @@ def _unpacked_means(header: SpzHeader, data: Uint8s) -> NDArray[np.floating[Any]
     # Put three bytes at the top of four, then shift down with the sign.
     wide = np.zeros((header.count, 3, 4), np.uint8)
     wide[:, :, 1:] = data.reshape(header.count, 3, 3)
-    return (wide.view("<i4")[:, :, 0] >> 8) / (1 << header.fraction_bits)
+    return (wide.view("<i4")[:, :, 0] >> 8).astype(np.float32) / (1 << header.fraction_bits)  # exact
 
 
 def _unpacked_harmonics(data: Uint8s, signs: Float32s) -> Float32s:

@@ -3,7 +3,7 @@
 import csv
 import io
 import json
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -127,13 +127,3 @@ def write_csv(path: Path, rows: Rows) -> None:
     writer.writeheader()
     writer.writerows(rows)
     write_text(path, text.getvalue())
-
-
-def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: Collection[str]) -> str:
-    """A Markdown table that also reads well as plain text; columns named in ``words`` align left, numbers right."""
-    columns = []
-    for name, *cells in zip(head, *rows, strict=True):
-        width = max(3, *map(len, (name, *cells)))
-        aligned, end = (str.ljust, "-") if name in words else (str.rjust, ":")
-        columns.append([aligned(cell, width) for cell in (name, aligned(end, width, "-"), *cells)])
-    return "\n".join(f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))

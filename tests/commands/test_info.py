@@ -31,7 +31,7 @@ def test_text_for_a_compressed_scene(tmp_path: Path, capsys: pytest.CaptureFixtu
     write_nsvq(path, _scene(1000), Storage("paper"))
     assert main(["info", str(path)]) == 0
     text = capsys.readouterr().out
-    lines = [line.split() for line in text.splitlines()]
+    lines = [line.replace("|", " ").split() for line in text.splitlines()]
     assert ["splats", "1,000"] in lines
     assert ["shN", "codes", "45", "16,384", "14"] in lines
     assert ["codes", "bits", "1,750", "14.00", f"{100 * 1750 / path.stat().st_size:.1f}", "%"] in lines

@@ -14,6 +14,7 @@ import torch
 from splat_scenes import front_camera, random_splats
 from torch import Tensor
 
+from nsvq_lightning.commands import markdown_table
 from nsvq_lightning.commands.benchmark.quantize import Attribute, step_errors
 from nsvq_lightning.commands.benchmark.quantize import step as quantize_step
 from nsvq_lightning.commands.benchmark.render import Painter, errors_of, painted, trace
@@ -24,7 +25,6 @@ from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
-from nsvq_lightning.report.numbers import markdown_table
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups

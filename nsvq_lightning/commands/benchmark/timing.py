@@ -14,9 +14,9 @@ from pathlib import Path
 import torch
 from llvmlite import binding
 
+from nsvq_lightning.commands import markdown_table
 from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.random import generator
-from nsvq_lightning.report.numbers import markdown_table
 from nsvq_lightning.version import __version__
 
 # What is timed.
