@@ -370,15 +370,12 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
     default = splats_for_photos(len(scene.train), detailed_pixels(scene))
     budget = round(wanted.quality * default)
     paper = round(PAPER_SPLATS * default)
-    photos = scene.images.nbytes
-    kept = min(photos, CACHE_BYTES)
+    kept = min(scene.images.nbytes, CACHE_BYTES)  # the others are decoded each time
     needed = 1.2e9 + kept  # Python, torch, Lightning, compiled kernels and evaluations
     needed += 59 * 4 * 6 * paper  # float32 of a splat, each with gradient, two moments, and copies while editing
     # Buffers of the renderer, the loss and the picture itself.
     needed += 100 * max(camera.width * camera.height for camera in scene.cameras)
     text = f"about {readable_bytes(needed)} with {paper:,} splats and {readable_bytes(kept)} of photos"
-    if photos > CACHE_BYTES:
-        text += f" (all would take {readable_bytes(photos)}; the others are decoded each time)"
     free = available_memory()
     advice = f"{readable_bytes(free or 0)} are available; lower --data.max_width or --data.cache_bytes"
     yield judged("run memory", text, advice, when=free is not None and needed > free)

@@ -44,6 +44,18 @@ def test_cameras_stand_where_the_detail_is_seen() -> None:
     assert 0.25 <= in_front[1] <= 0.6
 
 
+@pytest.mark.parametrize("is_room", [True, False])
+def test_a_room_is_seen_from_inside(is_room: bool) -> None:
+    """Oracle: colours of a sphere that change along the lines of sight of its middle, or across them."""
+    out = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)))
+    lines = out if is_room else torch.nn.functional.normalize(torch.linalg.cross(out, torch.tensor([[0.0, 1.0, 0.0]])))
+    harmonics = (lines[:, [1, 2, 0]] * torch.tensor([-1.0, 1.0, -1.0]))[:, :, None].expand(-1, -1, 3)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(500, 1)
+    ball = RawSplats(out, quats, torch.full((500, 3), -3.0), torch.full((500,), 3.0), torch.zeros(500, 1, 3), harmonics)
+    away = [np.linalg.norm(eye(camera)) for camera in likely_cameras(ball, 8, 32, 24)]
+    assert max(away) < 1 if is_room else min(away) > 1
+
+
 def test_the_same_scene_has_the_same_views_and_the_best_come_first() -> None:
     few, many = (likely_cameras(painting(), 5, 64, 48, seed=seed) for seed in (1, 1))
     assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(few, many, strict=True))

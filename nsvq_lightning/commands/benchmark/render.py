@@ -8,7 +8,6 @@ left out of the other errors: they say nothing about the quality of the arithmet
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -38,14 +37,13 @@ def run(scope: Scope) -> Iterator[Measurement]:
     for device in devices_with_kernels():
         for workload in workloads(scope):
             yield from _render_rows(workload.to(device), scope, device)
-            yield from _size_rows(workload.to(device), scope, device)
         yield from _loss_rows(scope, device)
 
 
-def painted(backend: str, splats: RawSplats, workload: Workload) -> Tensor:
+def painted(backend: str, splats: RawSplats, workload: Workload, sampling: Sampling | None = None) -> Tensor:
     """Render with a back-end; without that argument, it is a :data:`Painter`."""
     background = workload.background.to(splats.means)
-    return render(splats, workload.camera, background=background, backend=backend).image
+    return render(splats, workload.camera, background=background, backend=backend, sampling=sampling).image
 
 
 # Splats times pixels that the oracle is given, quick and full: half a minute on one core at most.
@@ -54,6 +52,9 @@ ORACLE_WORK = {True: 1e8, False: 6e9}
 
 def _render_rows(workload: Workload, scope: Scope, device: str) -> Iterator[Measurement]:
     fast: dict[str, Painter] = {name: partial(painted, name) for name in fast_backends(workload.splats.means)}
+    away = (workload.splats.means - workload.camera.position.to(workload.splats.means)).norm(dim=1)
+    as_trained = Sampling(torch.stack([0.99 * away, 1.01 * away]), [focal_of(workload.camera)])
+    fast |= {f"{name}, blur kept": partial(painted, name, sampling=as_trained) for name in fast}
     every = fast | {"plain torch": partial(painted, "reference")}
     crop = workload
     while len(crop.splats.means) * crop.camera.width * crop.camera.height > ORACLE_WORK[scope.quick]:
@@ -126,26 +127,6 @@ def image_errors(image: Tensor, truth: Tensor) -> tuple[dict[str, float], Tensor
         "pixels above 1e-3": float((error > 1e-3).sum()),
     }
     return errors, usual
-
-
-@torch.no_grad()
-def _size_rows(workload: Workload, scope: Scope, device: str) -> Iterator[Measurement]:
-    """What keeping the blur of training takes and brings, against the mean of the pixels of its size."""
-    camera = workload.camera
-    away = (workload.splats.means - camera.position.to(workload.splats.means)).norm(dim=1)
-    options: dict[str, dict[str, Any]] = {
-        "blur of a pixel": {},
-        "blur kept": {"sampling": Sampling(torch.stack([away, away]), [focal_of(camera)])},
-    }
-    trained = render(workload.splats, camera).image
-    for times in (1, 2):
-        view = camera.smaller(times)
-        width, height = view.width, view.height
-        truth = trained[: height * times, : width * times].view(height, times, width, times, 3).mean((1, 3))
-        cases = {name: partial(render, workload.splats, view, **given) for name, given in options.items()}
-        errors = {name: {"mean error": float((call().image - truth).abs().mean())} for name, call in cases.items()}
-        described = f"{workload.name}, {width}x{height}"
-        yield from compare("forward at another size", described, cases, errors, scope, device)
 
 
 PHOTO = (533, 800, 3)
