@@ -80,6 +80,21 @@ def test_a_file_has_at_most_the_bytes_that_it_may_have(small: Compressor, settin
         assert len(found.data) >= (1 - 3 * SLACK) * target or better
 
 
+@pytest.mark.parametrize(
+    ("ahead", "knows", "wins"), [(1.0, True, "codes"), (2.0, True, "basis"), (1.0, False, "basis")]
+)
+def test_from_known_cameras_a_basis_must_be_clearly_better(
+    small: Compressor, monkeypatch: pytest.MonkeyPatch, ahead: float, knows: bool, wins: str
+) -> None:
+    found = {"codes": small.at(Setting(400, "0.5k")), "basis": small.at(Setting(400, "none", True, 0.5))}
+    monkeypatch.setattr(small, "_fitting", lambda *_: found["basis"])
+    monkeypatch.setattr(small, "_finest_coded", lambda *_: found["codes"])
+    monkeypatch.setattr(small, "_known", small._known if knows else ())
+    monkeypatch.setattr(small, "quality", lambda each: 40 + ahead * (each is found["basis"]))
+    target = len(small.at(Setting(400, "none")).data) - 1
+    assert small.finest_within(target, 400) is found[wins]
+
+
 def test_a_file_that_codes_cannot_make_small_enough_has_fewer_splats(small: Compressor) -> None:
     found = small.finest_within(2 * len(small.at(Setting(400, "0.5k")).data) // 3, 400)
     assert len(found.scene) < 400
