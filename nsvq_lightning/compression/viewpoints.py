@@ -23,6 +23,8 @@ from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached, sh_d
 
 # Near plane of a guessed camera, as a share of the distance to what it looks at.
 NEARNESS = 0.02
+# So many splats are asked what cameras show, at most.
+SOME_SPLATS = 20_000
 
 
 def look_at(target: Float64s, eye: Float64s, width: int, height: int, angle: float) -> Camera:
@@ -142,9 +144,8 @@ def own_scene(
 # Share of a scene's splats that its cameras show at least. On six scenes, their own cameras show 99 %; with y and z
 # turned round or exchanged, 43 % at most.
 MIN_SHOWN = 0.8
-# So many of them are asked, at most.
+# So many cameras are asked, at most.
 SOME_CAMERAS = 300
-SOME_SPLATS = 20_000
 
 
 def check_cameras(cameras: Sequence[Camera], means: Float32s) -> None:

@@ -20,6 +20,8 @@ log = logging.getLogger(__name__)
 # Options of every launch. Triton's default is about to change; values on which the forward and backward pass must
 # agree to the bit are computed with an explicit ``fma``.
 COMPILE = {"enable_fp_fusion": True}
+# Why there are no kernels for a CUDA device.
+NEEDS_TRITON = "it needs Triton 3.4 or later, which CUDA builds of PyTorch 2.8 for Linux bring (pip install -U torch)"
 
 
 def kernels_for(like: Tensor) -> Literal["cpu", "cuda"] | None:
@@ -89,9 +91,6 @@ def _obstacle(kernels: str, like: Tensor) -> str | None:
             help_ = "torch finds no CUDA device here (nsvq doctor says why)"
         return f"it renders float32 tensors on a CUDA device, {got}; {help_}"
     return None if _has_triton() else NEEDS_TRITON
-
-
-NEEDS_TRITON = "it needs Triton 3.4 or later, which CUDA builds of PyTorch 2.8 for Linux bring (pip install -U torch)"
 
 
 @cache
