@@ -6,7 +6,7 @@ import csv
 import json
 from pathlib import Path
 from typing import Any
-from unittest.mock import ANY
+from unittest.mock import ANY, Mock
 
 import numpy as np
 import pytest
@@ -284,6 +284,14 @@ def test_splats_that_turn_non_finite_in_fine_tuning_are_dropped(
     assert 10 < module.history[-1]["psnr"] < 100
 
 
+class LateScalar(AsyncScalar):
+    """On the CPU, one that is on its way at first, as from a GPU."""
+
+    def __init__(self, value: torch.Tensor) -> None:
+        super().__init__(value)
+        self.is_here, self._copied = False, Mock(["synchronize"])
+
+
 def test_a_loss_that_is_known_only_after_the_backward_pass_changes_no_bit(
     run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -293,7 +301,7 @@ def test_a_loss_that_is_known_only_after_the_backward_pass_changes_no_bit(
         return module, [message for message in caplog.messages if "no update" in message]
 
     at_once, said_at_once = outcome()
-    monkeypatch.setattr(AsyncScalar, "is_here", property(lambda _: False))  # as on a GPU
+    monkeypatch.setattr("nsvq_lightning.training.module.AsyncScalar", LateScalar)
     late, said_late = outcome()
     assert len(said_late) == 2
     assert said_late == said_at_once
