@@ -266,19 +266,20 @@ class Compressor:
         Raises:
             ValueError: None was found.
         """
-        found: list[Candidate | None] = []
+        fits: Candidate | None = None
         if 8 * target >= ON_BASIS * splats:
             plain = Setting(splats, "none", self.scene.sh_degree > 0)
             exact = self.at(replace(plain, on_basis=False))
             fits = exact if len(exact.data) <= target else self._fitting(plain, target)
             if fits and (self.stopped or (fits is exact and self._is_own)):
                 return fits
-            found.append(fits)
-        found.append(self._finest_coded(target, splats, not any(found)))
-        if not any(found):
-            raise ValueError(f"found no file of {target} bytes: allow more bytes or time")
-        lead = LEAD if self._is_own and self._known else 0
-        return max(filter(None, found), key=lambda each: self.quality(each) - lead * each.setting.on_basis)
+        coded = self._finest_coded(target, splats, not fits)
+        if fits and coded:
+            lead = LEAD if self._is_own and self._known else 0
+            return max(fits, coded, key=lambda each: self.quality(each) - lead * each.setting.on_basis)
+        if found := fits or coded:
+            return found
+        raise ValueError(f"found no file of {target} bytes: allow more bytes or time")
 
     def _fitting(self, setting: Setting, target: int) -> Candidate | None:
         """The candidate nearest to the most exact one of at most ``target`` bytes."""

@@ -93,6 +93,10 @@ def test_from_known_cameras_a_basis_must_be_clearly_better(
     monkeypatch.setattr(small, "quality", lambda each: 40 + ahead * (each is found["basis"]))
     target = len(small.at(Setting(400, "none")).data) - 1
     assert small.finest_within(target, 400) is found[wins]
+    # One alone needs no judge, who would render many pictures.
+    monkeypatch.setattr(small, "quality", None)
+    monkeypatch.setattr(small, "_finest_coded", lambda *_: None)
+    assert small.finest_within(target, 400) is found["basis"]
 
 
 def test_a_file_that_codes_cannot_make_small_enough_has_fewer_splats(small: Compressor) -> None:
