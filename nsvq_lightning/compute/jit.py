@@ -116,6 +116,8 @@ def check_threads() -> None:
         )
 
 
+# More parts than this would not balance the threads better.
+MAX_PARTS = 64
 # Type of the numeric literals in kernels; Python floats would promote their operands to float64.
 F = np.float32
 
@@ -143,7 +145,10 @@ def kernel(function: Callable[..., Any], allocates: bool = True) -> Any:
     return dispatcher
 
 
-# What Numba's threads call, with where a range of parts begins and how many it has.
+# What all threads see of a kernel: number of parts; the next one, and where to end; sum of what the calls return;
+# number of those that failed; arguments.
+PARTS, NEXT, END, SUM, FAILURES, ARGUMENTS = range(6)
+# What Numba's threads call; the last argument is the state.
 _RANGE = ir.FunctionType(ir.VoidType(), [_byte_p.as_pointer(), _i64.as_pointer(), _i64.as_pointer(), _byte_p])
 _PARALLEL_FOR = ir.FunctionType(ir.VoidType(), [_byte_p] * 5 + [_i64] * 3)
 
@@ -152,8 +157,9 @@ _PARALLEL_FOR = ir.FunctionType(ir.VoidType(), [_byte_p] * 5 + [_i64] * 3)
 def in_parallel(typingctx: Any, helper: Any, parts: Any, arguments: Any) -> Any:
     """``in_parallel(helper, parts, arguments)``: call ``helper(part, parts, *arguments)`` for every part.
 
-    Returns the sum of what the calls return where that is an integer, else 0. Numba's own ``prange`` finds out by
-    itself what may run in parallel, and makes a function of each loop: half of the time of a compilation.
+    Each thread takes the next part when it is done with one, so that a slow or busy core delays nobody; a single part
+    wakes no thread. Returns the sum of what the calls return where that is an integer, else 0. Numba's own ``prange``
+    finds out by itself what may run in parallel, and makes a function of each loop: half of the time of a compilation.
 
     Raises:
         MemoryError: A call failed, for which there is no other reason.
@@ -165,40 +171,50 @@ def in_parallel(typingctx: Any, helper: Any, parts: Any, arguments: Any) -> Any:
     def emit(context: Any, builder: Any, sig: Any, values: Any) -> Any:
         compiled = helper.dispatcher.overloads[given]
         context.active_code_library.add_linking_library(compiled.library)
-        # What all threads see: number of parts, sum of what the calls return, number of those that failed, arguments.
-        packed = cgutils.pack_struct(builder, [values[1], _i64(0), _i64(0), values[2]])
+        packed = cgutils.pack_struct(builder, [values[1], _i64(0), values[1], _i64(0), _i64(0), values[2]])
         state = cgutils.alloca_once_value(builder, packed)
         share = ir.Function(builder.module, _RANGE, f"{compiled.fndesc.mangled_name}.share")
         share.linkage = "internal"
         _emit_share(context, ir.IRBuilder(share.append_basic_block()), compiled, state.type, arguments)
-        # A base address of 0 that moves by 1 from part to part: the number of the part.
-        base, moves = cgutils.alloca_once_value(builder, _byte_p(None)), cgutils.alloca_once_value(builder, _i64(1))
-        count = cgutils.alloca_once_value(builder, values[1])
-        pointers = [builder.bitcast(pointer, _byte_p) for pointer in (share, base, count, moves, state)]
-        run = cgutils.get_or_insert_function(builder.module, _PARALLEL_FOR, "numba_parallel_for")
         threads = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_i64, []), "get_num_threads")
-        builder.call(run, [*pointers, _i64(0), _i64(1), builder.call(threads, [])])
-        failures = builder.load(cgutils.gep_inbounds(builder, state, 0, 2))
+        count = builder.call(threads, [])
+        count = builder.select(builder.icmp_signed("<", values[1], count), values[1], count)
+        # Numba's threads find a base address that does not move from share to share.
+        base, moves, counts = (cgutils.alloca_once_value(builder, value) for value in (_byte_p(None), _i64(0), count))
+        pointers = [builder.bitcast(pointer, _byte_p) for pointer in (share, base, counts, moves, state)]
+        run = cgutils.get_or_insert_function(builder.module, _PARALLEL_FOR, "numba_parallel_for")
+        with builder.if_else(builder.icmp_signed(">", count, _i64(1))) as (several, one):
+            with several:
+                builder.call(run, [*pointers, _i64(0), _i64(1), count])
+            with one:
+                builder.call(share, [base, counts, moves, pointers[-1]])
+        failures = builder.load(cgutils.gep_inbounds(builder, state, 0, FAILURES))
         with builder.if_then(builder.icmp_signed("!=", failures, _i64(0)), likely=False):
             context.call_conv.return_user_exc(builder, MemoryError, ("a kernel could not allocate memory",))
-        return builder.load(cgutils.gep_inbounds(builder, state, 0, 1))
+        return builder.load(cgutils.gep_inbounds(builder, state, 0, SUM))
 
     return types.int64(helper, parts, arguments), emit
 
 
 def _emit_share(context: Any, builder: Any, compiled: Any, state_type: Any, arguments: Any) -> None:
-    """The calls for a range of parts, by one thread."""
-    bases, counts, _, data = builder.function.args
-    state = builder.bitcast(data, state_type)
-    first = builder.ptrtoint(builder.load(bases), _i64)
-    parts, packed = (builder.load(cgutils.gep_inbounds(builder, state, 0, place)) for place in (0, 3))
+    """The calls of one thread: it takes parts until there are none."""
+    state = builder.bitcast(builder.function.args[-1], state_type)
+    fields = [cgutils.gep_inbounds(builder, state, 0, place) for place in range(ARGUMENTS + 1)]
+    parts, end, packed = (builder.load(fields[place]) for place in (PARTS, END, ARGUMENTS))
     values = cgutils.unpack_tuple(builder, packed, len(arguments))
-    with cgutils.for_range(builder, builder.load(counts)) as loop:
-        given = [builder.add(first, loop.index), parts, *values]
-        status, result = context.call_internal_no_propagate(builder, compiled.fndesc, compiled.signature, given)
-        found = result if compiled.signature.return_type == types.int64 else _i64(0)
-        for place, value in ((1, found), (2, builder.zext(status.is_error, _i64))):
-            builder.atomic_rmw("add", cgutils.gep_inbounds(builder, state, 0, place), value, "monotonic")
+    take, call, leave = map(builder.append_basic_block, ("take", "call", "leave"))
+    builder.branch(take)
+    builder.position_at_end(take)
+    part = builder.atomic_rmw("add", fields[NEXT], _i64(1), "monotonic")
+    builder.cbranch(builder.icmp_signed("<", part, end), call, leave)
+    builder.position_at_end(call)
+    given = [part, parts, *values]
+    status, result = context.call_internal_no_propagate(builder, compiled.fndesc, compiled.signature, given)
+    found = result if compiled.signature.return_type == types.int64 else _i64(0)
+    for place, value in ((SUM, found), (FAILURES, builder.zext(status.is_error, _i64))):
+        builder.atomic_rmw("add", fields[place], value, "monotonic")
+    builder.branch(take)
+    builder.position_at_end(leave)
     builder.ret_void()
 
 
@@ -211,6 +227,12 @@ def parallel(function: Callable[..., Any]) -> Any:
 
     whole.__module__, whole.__name__, whole.__qualname__ = function.__module__, function.__name__, function.__qualname__
     return kernel(whole)
+
+
+def parts_of(count: int, each: int) -> int:
+    """How many parts to make of ``count`` things, of ``each`` or more: the same on any number of threads, 1 to 64."""
+    thread_count()
+    return max(1, min(MAX_PARTS, count // each))
 
 
 def thread_count() -> int:

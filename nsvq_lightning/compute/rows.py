@@ -1,4 +1,4 @@
-"""Copy distinct rows out of a table, and back into one."""
+"""Rows and numbers: in shares of whole vectors, and distinct ones out of a table and back into one."""
 
 from typing import Any, cast
 
@@ -6,10 +6,54 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import inline
 from nsvq_lightning.compute.memory import recycled
 from nsvq_lightning.compute.simd import get, put
+
+
+@inline
+def share(count, part, parts):
+    """First and end of a part of ``count`` things."""
+    return count * part // parts, count * (part + 1) // parts
+
+
+@inline
+def vector_share(count, part, parts):
+    """The same of ``count`` splats: whole vectors, except for the very last one."""
+    vectors = (count + 15) // 16
+    return 16 * (vectors * part // parts), min(count, 16 * (vectors * (part + 1) // parts))
+
+
+def _loader(columns, load):
+    """A helper that loads 16 rows; an incomplete last vector is read from a copy."""
+
+    @inline
+    def load_rows(rows, start, count):
+        if count < 16:
+            padded = simd.scratch(64)
+            for k in range(columns * count):
+                simd.put(padded, k, simd.get(rows, columns * start + k))
+            return load(padded, 0)
+        return load(rows, columns * start)
+
+    return load_rows
+
+
+load_numbers, load_vectors, load_quats = _loader(1, simd.load), _loader(3, simd.load_rows3), _loader(4, simd.load_rows4)
+
+
+@inline
+def store_numbers(numbers, start, count, lanes):
+    """The inverse of ``load_numbers``."""
+    if count < 16:
+        padded = simd.scratch(16)
+        simd.store(padded, 0, lanes)
+        for k in range(count):
+            simd.put(numbers, start + k, simd.get(padded, k))
+    else:
+        simd.store(numbers, start, lanes)
 
 
 @inline

@@ -313,7 +313,7 @@ class Edges(NamedTuple):
 
     def strength(self, device: torch.device | str = "cpu") -> Tensor:
         """Strength ``[H, W]`` float32 in [0, 1]: 1 for the strongest edge."""
-        return to_device(self.values, device).float() / self.strongest
+        return to_device(self.values, device) / self.strongest
 
 
 def edges_of(image: Tensor, mask: Tensor | None = None) -> Edges:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.compute.jit import parallel, thread_count
+from nsvq_lightning.compute.jit import parallel, parts_of
 from nsvq_lightning.compute.memory import Array
 from nsvq_lightning.quantize.box_search import MAX_DIM, box_search, code_distances, place_of_least
 from nsvq_lightning.quantize.scores import score_search
@@ -131,7 +131,7 @@ def cheapest(x: Tensor, codebook: Tensor, rates: Tensor, prices: Tensor) -> Tens
     table = _blocks(codebook.numpy(), rates.float().numpy())
     result = np.empty(len(x), np.int64)
     queries, dearness = x.contiguous().numpy().ravel(), prices.float().contiguous().numpy()
-    _search_kernel(x.shape[1])(thread_count(), queries, dearness, table, result)
+    _search_kernel(x.shape[1])(parts_of(len(x), 64), queries, dearness, table, result)
     return torch.from_numpy(result)
 
 
@@ -153,9 +153,9 @@ def _blocks(codebook: Array, rates: Array) -> Array:
 def _search_kernel(dim: int) -> Any:
     """The search for one dimension, a compile-time constant."""
 
-    def search(thread, threads, x, prices, table, result):
+    def search(part, parts, x, prices, table, result):
         blocks = table.shape[0] // (16 * (dim + 1))
-        for i in range(result.shape[0] * thread // threads, result.shape[0] * (thread + 1) // threads):
+        for i in range(result.shape[0] * part // parts, result.shape[0] * (part + 1) // parts):
             price = simd.get(prices, i)
             best, block_of = simd.broadcast(np.inf), simd.broadcast(0)
             for block in range(blocks):

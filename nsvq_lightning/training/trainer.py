@@ -2,11 +2,13 @@
 
 import logging
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch import Trainer
+from lightning.pytorch.profilers import PassThroughProfiler
 from lightning.pytorch.strategies import DDPStrategy
 
 from nsvq_lightning.compute.devices import best_device
@@ -15,6 +17,15 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import PlainCheckpointIO, read_checkpoint
 
 log = logging.getLogger(__name__)
+
+_NOTHING = nullcontext()
+
+
+class _NoProfiler(PassThroughProfiler):
+    """Lightning's, without a new context around each hook of each callback: a hundred a step."""
+
+    def profile(self, action_name: str) -> nullcontext[None]:  # type: ignore[override]
+        return _NOTHING
 
 
 # What Lightning's trainer has otherwise.
@@ -48,6 +59,7 @@ class SplatTrainer(Trainer):
         self, *args: Any, run_folder: str | None = None, allow_other_scene: bool = False, **kwargs: Any
     ) -> None:
         kwargs = TRAINER_DEFAULTS | {"logger": False} | kwargs
+        kwargs["profiler"] = kwargs.get("profiler") or _NoProfiler()
         if kwargs.get("accelerator", "auto") == "auto":
             kwargs["accelerator"] = best_device().type
         several = "view_parallel_notebook" if hasattr(sys, "ps1") else "view_parallel"

@@ -96,9 +96,9 @@ def test_broken_splats_leave_the_rest_alone(attribute: str, value: float) -> Non
         torch.testing.assert_close(result.image, render(rest, front_camera()).image, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("threads", [1, 20])
-def test_visible_is_radii(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rasterizer, "thread_count", lambda: threads)
+@pytest.mark.parametrize("parts", [1, 20])
+def test_visible_is_radii(parts: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rasterizer, "parts_of", lambda count, each: parts)
     splats, camera = random_splats(200, seed=11), front_camera(40, 30, cx=3.0)
     result = render(splats, camera)
     for backend in ("cpu", "reference"):

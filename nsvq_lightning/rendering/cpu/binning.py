@@ -3,8 +3,9 @@
 import numpy as np
 
 from nsvq_lightning.compute.jit import in_parallel, inline, kernel, parallel
+from nsvq_lightning.compute.rows import share
 from nsvq_lightning.compute.simd import get, prefetch, put
-from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES, share
+from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES
 
 DIGIT_BITS = 11
 DIGITS = 1 << DIGIT_BITS
@@ -14,19 +15,19 @@ AHEAD = 16
 
 
 @inline
-def _count_digits(thread, threads, count, source, low, shift, histogram):
-    row = histogram[thread]
+def _count_digits(part, parts, count, source, low, shift, histogram):
+    row = histogram[part]
     row[:] = 0
-    first, end = share(count, thread, threads)
+    first, end = share(count, part, parts)
     for i in range(first, end):
         row[((np.int64(get(source, i)) - low) >> shift) & (DIGITS - 1)] += 1
 
 
 @inline
-def _move(thread, threads, count, source, from_ids, target, to_ids, low, shift, histogram):
+def _move(part, parts, count, source, from_ids, target, to_ids, low, shift, histogram):
     """Move keys and what belongs to them to where their digits belong."""
-    row = histogram[thread]
-    first, end = share(count, thread, threads)
+    row = histogram[part]
+    first, end = share(count, part, parts)
     for i in range(first, end):
         key = get(source, i)
         digit = ((np.int64(key) - low) >> shift) & (DIGITS - 1)
@@ -37,10 +38,10 @@ def _move(thread, threads, count, source, from_ids, target, to_ids, low, shift, 
 
 
 @kernel
-def sort_by_depth(threads, count, keys, ids, keys2, ids2, histogram):
+def sort_by_depth(parts, count, keys, ids, keys2, ids2, histogram):
     """Stable radix sort of ``ids`` by ``keys`` (bits of positive floats); returns whether the result is in ``ids2``.
 
-    Only the digits in which the keys differ are sorted. ``histogram`` is [threads, DIGITS].
+    Only the digits in which the keys differ are sorted. ``histogram`` is [parts, DIGITS].
     """
     low, high = np.int64(keys[0]), np.int64(keys[0])
     for i in range(count):
@@ -50,14 +51,14 @@ def sort_by_depth(threads, count, keys, ids, keys2, ids2, histogram):
     while (high - low) >> shift != 0:
         source, target = (keys2, keys) if swapped else (keys, keys2)
         from_ids, to_ids = (ids2, ids) if swapped else (ids, ids2)
-        in_parallel(_count_digits, threads, (count, source, low, shift, histogram))
+        in_parallel(_count_digits, parts, (count, source, low, shift, histogram))
         total = 0
         for digit in range(DIGITS):
-            for thread in range(threads):
-                here = histogram[thread, digit]
-                histogram[thread, digit] = total
+            for part in range(parts):
+                here = histogram[part, digit]
+                histogram[part, digit] = total
                 total += here
-        in_parallel(_move, threads, (count, source, from_ids, target, to_ids, low, shift, histogram))
+        in_parallel(_move, parts, (count, source, from_ids, target, to_ids, low, shift, histogram))
         swapped = not swapped
         shift += DIGIT_BITS
     return swapped
@@ -80,12 +81,12 @@ def tile_range(boxes, place):
 
 
 @inline
-def _visit_tiles(thread, threads, count, order, boxes, group_columns, histogram, ids, entries):
+def _visit_tiles(part, parts, count, order, boxes, group_columns, histogram, ids, entries):
     """Count the splats of every tile; or write their rows (``ids``, by place) into its list, keeping the order."""
-    row = histogram[thread]
+    row = histogram[part]
     if entries is None:
         row[:] = 0
-    first, end = share(count, thread, threads)
+    first, end = share(count, part, parts)
     for i in range(first, end):
         if i + AHEAD < end:
             coming = np.int64(get(order, i + AHEAD))
@@ -105,27 +106,27 @@ def _visit_tiles(thread, threads, count, order, boxes, group_columns, histogram,
 
 
 @kernel
-def count_tiles(threads, count, order, boxes, group_columns, histogram, offsets):
+def count_tiles(parts, count, order, boxes, group_columns, histogram, offsets):
     """Count the splats that touch each tile: the list of tile t begins at ``offsets[t]``; returns the total length.
 
     ``order`` holds the places of the visible splats, front to back; ``boxes`` their tiles, by place: first column and
-    row, number of columns and rows, 16 bits each. ``histogram`` [threads, tiles] becomes the position of each thread's
+    row, number of columns and rows, 16 bits each. ``histogram`` [parts, tiles] becomes the position of each part's
     first entry in every tile.
     """
-    in_parallel(_visit_tiles, threads, (count, order, boxes, group_columns, histogram, None, None))
+    in_parallel(_visit_tiles, parts, (count, order, boxes, group_columns, histogram, None, None))
     tiles = offsets.shape[0] - 1
     total = 0
     for tile in range(tiles):
         offsets[tile] = total
-        for thread in range(threads):
-            here = histogram[thread, tile]
-            histogram[thread, tile] = total
+        for part in range(parts):
+            here = histogram[part, tile]
+            histogram[part, tile] = total
             total += here
     offsets[tiles] = total
     return total
 
 
 @parallel
-def fill_tiles(thread, threads, count, order, boxes, group_columns, histogram, ids, entries):
+def fill_tiles(part, parts, count, order, boxes, group_columns, histogram, ids, entries):
     """Write the row of every splat (``ids``, by place) into the lists of its tiles, keeping the order."""
-    _visit_tiles(thread, threads, count, order, boxes, group_columns, histogram, ids, entries)
+    _visit_tiles(part, parts, count, order, boxes, group_columns, histogram, ids, entries)

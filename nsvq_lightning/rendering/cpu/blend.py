@@ -13,6 +13,7 @@ import numpy as np
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel
+from nsvq_lightning.compute.rows import share
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.formulas import (
     ALPHA_MAX,
@@ -206,7 +207,7 @@ def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
 def write_block(block, corner, size, background, state, planes):
     """Add the background and write one block, pixel by pixel where it extends beyond the image."""
     width, height = size
-    image, transmittance, depth = planes
+    image, transmittance, depth, alpha = planes
     o = 16 * block
     x0, y0 = block_corner(block, corner)
     t = simd.load(state, T_LEFT + o)
@@ -216,6 +217,7 @@ def write_block(block, corner, size, background, state, planes):
         simd.store_block3(image, 3 * pixel, 3 * width, color)
         simd.store_block1(transmittance, pixel, width, (t,))
         simd.store_block1(depth, pixel, width, (simd.load(state, Z_SUM + o),))
+        simd.store_block1(alpha, pixel, width, (1 - t,))
         return
     store_color(state, o, color)
     for lane in range(16):
@@ -225,6 +227,7 @@ def write_block(block, corner, size, background, state, planes):
             s = o + lane
             simd.put(transmittance, pixel, simd.get(state, T_LEFT + s))
             simd.put(depth, pixel, simd.get(state, Z_SUM + s))
+            simd.put(alpha, pixel, 1 - simd.get(state, T_LEFT + s))
             for channel in range(3):
                 simd.put(image, 3 * pixel + channel, simd.get(state, R_SUM + 256 * channel + s))
 
@@ -291,29 +294,22 @@ def tile_corner(tile, group_columns):
 
 
 @parallel
-def blend(
-    thread, threads, records, entries, offsets, group_columns, size, background, grid, touched, ends, planes, scratch,
-    skips, counter,
-):  # fmt: skip
-    """Blend all tiles, scheduled dynamically; a pixel depends only on its own tile.
+def blend(tile, tiles, records, entries, offsets, group_columns, size, background, grid, touched, ends, planes, skips):
+    """Blend a tile; a pixel depends only on its own one.
 
-    ``size`` is width and height, ``planes`` are image, transmittance and depth. ``skips`` says whether to skip the
-    blocks that a splat cannot reach, and those whose pixels are all closed.
+    ``size`` is width and height, ``planes`` are image, transmittance, depth and alpha. ``skips`` says whether to skip
+    the blocks that a splat cannot reach, and those whose pixels are all closed.
     """
-    tiles = offsets.shape[0] - 1
-    while True:
-        tile = simd.fetch_add(counter, 0, 1)
-        if tile >= tiles:
-            break
-        corner = tile_corner(tile, group_columns)
-        if corner[0] < size[0] and corner[1] < size[1]:
-            begin, end = np.int64(offsets[tile]), np.int64(offsets[tile + 1])
-            ends[tile] = blend_tile(
-                records, entries, begin, end, corner, size, background, grid, touched, planes, scratch[thread],
-                skips,
-            )  # fmt: skip
-        else:
-            ends[tile] = offsets[tile]
+    corner = tile_corner(tile, group_columns)
+    begin, end = np.int64(offsets[tile]), np.int64(offsets[tile + 1])
+    if corner[0] < size[0] and corner[1] < size[1]:
+        end = blend_tile(
+            records, entries, begin, end, corner, size, background, grid, touched, planes,
+            simd.scratch(FORWARD_SCRATCH), skips,
+        )  # fmt: skip
+    else:
+        end = begin
+    ends[tile] = end
 
 
 @inline
@@ -450,39 +446,35 @@ def tile_backward(records, integers, entries, begin, end, corner, group, wanted,
 
 @parallel
 def blend_backward(
-    thread, threads, records, integers, entries, offsets, ends, group_columns, size, grid, touched, planes, gradients,
-    pixel_weights, wanted, sums, scratch, counter,
+    place, groups, order, records, integers, entries, offsets, ends, group_columns, size, grid, touched, planes,
+    gradients, pixel_weights, wanted, sums,
 ):  # fmt: skip
-    """Add the sums of every (splat, group) pair to its slot; groups are scheduled dynamically, each in one order.
+    """Add the sums of every (splat, group) pair of one group to its slot, in one order.
 
-    ``sums`` must be 0. ``size`` and ``planes`` are those of :func:`blend`, ``gradients`` those of image, alpha and
-    depth; ``wanted`` says whether alpha and depth have one, and whether there is a map.
+    ``order`` lists the groups, those with most to do first. ``sums`` must be 0. ``size`` and ``planes`` are those of
+    :func:`blend`, ``gradients`` those of image, alpha and depth; ``wanted`` says whether alpha and depth have one, and
+    whether there is a map.
     """
-    tiles = offsets.shape[0] - 1
-    groups = tiles // rec.GROUP_TILES
-    state = scratch[thread]
-    while True:
-        group = simd.fetch_add(counter, 0, 1)
-        if group >= groups:
-            break
-        for tile in range(rec.GROUP_TILES * group, rec.GROUP_TILES * (group + 1)):
-            begin, end = np.int64(offsets[tile]), np.int64(ends[tile])
-            if end <= begin:
-                continue
-            corner = tile_corner(tile, group_columns)
-            for block in range(BLOCKS):
-                start_block(block, corner, size, planes, gradients, pixel_weights, wanted, grid, state)
-            place = group % group_columns, group // group_columns
-            tile_backward(records, integers, entries, begin, end, corner, place, wanted, touched, sums, state)
+    group = np.int64(order[place])
+    at = group % group_columns, group // group_columns
+    state = simd.scratch(BACKWARD_SCRATCH)
+    for tile in range(rec.GROUP_TILES * group, rec.GROUP_TILES * (group + 1)):
+        begin, end = np.int64(offsets[tile]), np.int64(ends[tile])
+        if end <= begin:
+            continue
+        corner = tile_corner(tile, group_columns)
+        for block in range(BLOCKS):
+            start_block(block, corner, size, planes, gradients, pixel_weights, wanted, grid, state)
+        tile_backward(records, integers, entries, begin, end, corner, at, wanted, touched, sums, state)
 
 
 @parallel
-def total_slots(thread, threads, ids, count, slots, records, integers, sums, g_means2d, with_absgrad, absgrad):
+def total_slots(part, parts, ids, count, slots, records, integers, sums, g_means2d, with_absgrad, absgrad):
     """Add up the slots of each splat into its first one, and derive the gradient of the projected centre ``[N·2]``.
 
     ``with_absgrad`` also writes sums over the pixels ``[N·3]``: Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · pixel weight.
     """
-    first, last = rec.share(count, thread, threads)
+    first, last = share(count, part, parts)
     for i in range(first, last):
         row = np.int64(simd.get(ids, i))
         r = rec.RECORD * row

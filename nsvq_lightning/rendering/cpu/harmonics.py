@@ -24,6 +24,8 @@ AHEAD = 32
 
 # Floats in a row of degree-3 coefficients, which is read in whole vectors.
 SH_ROW = 45
+# Floats in the columns of 16 rows.
+COLUMNS = 16 * 48
 
 
 @inline
@@ -86,8 +88,9 @@ def color(degree, d, sh0, columns):
 
 
 @inline
-def color_range(camera, means, colors, bands, ids, first, last, records, scratch):
+def color_range(camera, means, colors, bands, ids, first, last, records):
     """Write colours to the records of ``ids[first:last]``; the list is padded to whole vectors."""
+    scratch = simd.scratch(COLUMNS)
     (sh0, shN), (stride, degree) = colors, bands
     coefficients = coefficients_of(degree)
     for start in range(first, last, 16):
@@ -145,12 +148,12 @@ def scatter_sh(gradient, columns, ids, start, stride, count):
 
 
 @inline
-def color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, scratch):
+def color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN):
     """Gradients of the SH coefficients; returns that of the mean through the viewing direction."""
     stride, degree = bands
     d, inverse = unit_direction(rec.load3(camera, rec.POSITION), mean)
     coefficients = coefficients_of(degree)
-    columns, gradient, e = scratch[:768], scratch[768:1536], scratch[1536:]
+    columns, gradient, e = simd.scratch(COLUMNS), simd.scratch(COLUMNS), simd.scratch(256)
     if degree > 0:
         gather_sh(shN, ids, start, stride, coefficients, columns)
     simd.scatter_rows3(g_sh0, ids, start, scale3(C0, rgb))

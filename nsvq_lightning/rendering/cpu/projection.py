@@ -4,9 +4,13 @@ import numpy as np
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel
+from nsvq_lightning.compute.rows import load_numbers, load_quats, load_vectors, vector_share
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import color_range
 from nsvq_lightning.rendering.formulas import footprint, view_point
+
+# Floats between a lane of vectors and the records that they become.
+PROJECTION_SCRATCH = 128 + 16 * rec.RECORD
 
 
 @inline
@@ -17,63 +21,29 @@ def load_screen(camera):
 
 
 @inline
-def load_means(means, start, count, scratch):
-    """16 means; the last, incomplete vector is read from a padded copy."""
-    if count < 16:
-        for k in range(3 * count):
-            simd.put(scratch, k, simd.get(means, 3 * start + k))
-        return simd.load_rows3(scratch, 0)
-    return simd.load_rows3(means, 3 * start)
-
-
-@inline
-def load_numbers(numbers, start, count, scratch):
-    """A number of 16 splats, an incomplete vector as in :func:`load_means`."""
-    if count < 16:
-        for k in range(count):
-            simd.put(scratch, k, simd.get(numbers, start + k))
-        return simd.load(scratch, 0)
-    return simd.load(numbers, start)
-
-
-@inline
-def load_shapes(quats, scales, logits, start, count, scratch):
-    """16 quaternions, log scales and opacity logits, an incomplete vector as in :func:`load_means`."""
-    if count < 16:
-        for k in range(4 * count):
-            simd.put(scratch, k, simd.get(quats, 4 * start + k))
-        quat = simd.load_rows4(scratch, 0)
-        for k in range(3 * count):
-            simd.put(scratch, k, simd.get(scales, 3 * start + k))
-        scale = simd.load_rows3(scratch, 0)
-        for k in range(count):
-            simd.put(scratch, k, simd.get(logits, start + k))
-        return quat, scale, simd.load(scratch, 0)
-    return simd.load_rows4(quats, 4 * start), simd.load_rows3(scales, 3 * start), simd.load(logits, start)
-
-
-@inline
-def project_range(camera, sampling, means, quats, scales, logits, first, last, records, integers, ids, scratch):
+def project_range(camera, sampling, means, quats, scales, logits, first, last, records, integers, ids):
     """Write the records of a range's visible splats; returns how many there are and how many slots they need.
 
     ``sampling`` are nearest and farthest distances, and the size, or None.
     """
+    scratch = simd.scratch(PROJECTION_SCRATCH)
     zero = simd.broadcast(0)
     visible = 0
     slots = 0
     for start in range(first, last, 16):
         count = min(16, last - start)
-        mean = load_means(means, start, count, scratch)
+        mean = load_vectors(means, start, count)
         lanes = (1 << count) - 1
         view = rec.load_view(camera)
         point = view_point(view, mean)
         if simd.mask_bits(point[2] > simd.load_one(camera, rec.NEAR)) & lanes == 0:
             continue
-        quat, scale, logit = load_shapes(quats, scales, logits, start, count, scratch)
+        quat, scale = load_quats(quats, start, count), load_vectors(scales, start, count)
+        logit = load_numbers(logits, start, count)
         trained_at = None
         if sampling is not None:
-            nearest = load_numbers(sampling[0], start, count, scratch)
-            farthest = load_numbers(sampling[1], start, count, scratch)
+            nearest = load_numbers(sampling[0], start, count)
+            farthest = load_numbers(sampling[1], start, count)
             trained_at = nearest, farthest, simd.broadcast(sampling[2])
         seen, record, corner, end, radius = footprint(view, load_screen(camera), point, quat, scale, logit, trained_at)
         bits = simd.mask_bits(seen) & lanes
@@ -108,18 +78,18 @@ def project_range(camera, sampling, means, quats, scales, logits, first, last, r
 
 @parallel
 def project_splats(
-    thread, threads, camera, sampling, means, quats, scales, logits, records, integers, found, counts, slots, scratch
+    part, parts, camera, sampling, means, quats, scales, logits, records, integers, found, counts, slots
 ):
-    """Write the records of all visible splats; ``found`` gets a run of rows for each thread's range."""
-    first, last = rec.vector_share(logits.shape[0], thread, threads)
-    counts[thread], slots[thread] = project_range(
-        camera, sampling, means, quats, scales, logits, first, last, records, integers, found, scratch[thread]
+    """Write the records of the visible splats of a range; ``found`` gets a run of rows for each."""
+    first, last = vector_share(logits.shape[0], part, parts)
+    counts[part], slots[part] = project_range(
+        camera, sampling, means, quats, scales, logits, first, last, records, integers, found
     )
 
 
 @parallel
-def join_runs(thread, threads, runs, records, integers, listed, means2d, radii):
-    """Join the runs of all threads into ``ids`` (ascending rows, padded by 16), and number the slots.
+def join_runs(part, parts, runs, records, integers, listed, means2d, radii):
+    """Join the runs of all ranges into ``ids`` (ascending rows, padded by 16), and number the slots.
 
     ``runs`` are what :func:`project_splats` found, ``listed`` ids, keys, order and boxes.
 
@@ -130,9 +100,9 @@ def join_runs(thread, threads, runs, records, integers, listed, means2d, radii):
     found, counts, slots = runs
     ids, keys, order, boxes = listed
     total = counts.sum()
-    first, _ = rec.vector_share(records.shape[0] // rec.RECORD, thread, threads)
-    start, slot = counts[:thread].sum(), slots[:thread].sum()
-    for k in range(counts[thread]):
+    first, _ = vector_share(records.shape[0] // rec.RECORD, part, parts)
+    start, slot = counts[:part].sum(), slots[:part].sum()
+    for k in range(counts[part]):
         row = np.int64(simd.get(found, first + k))
         o = rec.RECORD * row
         simd.put(ids, start + k, row)
@@ -145,16 +115,16 @@ def join_runs(thread, threads, runs, records, integers, listed, means2d, radii):
         simd.put(means2d, 2 * row, simd.get(records, o + rec.X))
         simd.put(means2d, 2 * row + 1, simd.get(records, o + rec.Y))
         simd.put(radii, row, simd.get(integers, o + rec.RADIUS))
-    if start + counts[thread] == total and counts[thread] > 0:
+    if start + counts[part] == total and counts[part] > 0:
         for k in range(16):
             simd.put(ids, total + k, simd.get(ids, total - 1))
 
 
 @parallel
-def add_colors(thread, threads, camera, means, colors, bands, ids, count, records, scratch):
+def add_colors(part, parts, camera, means, colors, bands, ids, count, records):
     """Write the colours of the visible splats to their records.
 
     ``colors`` are sh0 and shN, ``bands`` the floats in a row of shN and the degree that counts.
     """
-    first, last = rec.vector_share(count, thread, threads)
-    color_range(camera, means, colors, bands, ids, first, last, records, scratch[thread])
+    first, last = vector_share(count, part, parts)
+    color_range(camera, means, colors, bands, ids, first, last, records)

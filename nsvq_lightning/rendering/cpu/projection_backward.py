@@ -4,7 +4,7 @@ import numpy as np
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import inline, parallel
-from nsvq_lightning.compute.rows import clear
+from nsvq_lightning.compute.rows import clear, vector_share
 from nsvq_lightning.rendering import formulas
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import AHEAD, coefficients_of, color_backward, prefetch_sh
@@ -24,9 +24,8 @@ def clear_rows(first, last, stride, gradients):
 
 @parallel
 def project_backward(
-    thread, threads, camera, sampling, geometry, shN, bands, ids, count, records, integers, sums, g_means2d,
-    gradients, scratch,
-):  # fmt: skip
+    part, parts, camera, sampling, geometry, shN, bands, ids, count, records, integers, sums, g_means2d, gradients
+):
     """Gradients of all raw attributes from the sums of the slots of the visible splats; 0 for the others.
 
     ``sums[16·slot]`` of a splat's first slot holds its total; ``g_means2d [N·2]`` the gradient of its projected centre.
@@ -36,17 +35,16 @@ def project_backward(
     means, quats, scales, logits = geometry
     g_means, g_quats, g_scales, g_logits, g_sh0, g_shN = gradients
     stride, coefficients = bands[0], coefficients_of(bands[1])
-    work = scratch[thread]
-    slot = work[2048:].view(np.int32)
-    # Between its first and last visible splat, every thread clears the rows that it skips.
-    begin, end = rec.vector_share(count, thread, threads)
+    work, slot = simd.scratch(32), simd.scratch(16).view(np.int32)
+    # Between its first and last visible splat, every part clears the rows that it skips.
+    begin, end = vector_share(count, part, parts)
     row = np.int64(simd.get(ids, begin - 1)) + 1 if begin > 0 else 0
     for i in range(begin, end):
         here = np.int64(simd.get(ids, i))
         if here > row:
             clear_rows(row, here, stride, gradients)
         row = here + 1
-    if thread == threads - 1:
+    if part == parts - 1:
         clear_rows(row, logits.shape[0], stride, gradients)
     for start in range(begin, end, 16):
         prefetch_sh(shN, ids, start + AHEAD, end, stride, coefficients)
@@ -78,7 +76,7 @@ def project_backward(
         )  # fmt: skip
         colors = record[rec.RED : rec.DEPTH]
         rgb = formulas.unclamped(colors, total[rec.SUM_RED : rec.SUM_H])
-        through_color = color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN, work)
+        through_color = color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN)
         simd.scatter_rows3(g_means, ids, start, formulas.add3(g_mean, through_color))
         simd.scatter_rows4(g_quats, ids, start, g_quat)
         simd.scatter_rows3(g_scales, ids, start, g_scale)

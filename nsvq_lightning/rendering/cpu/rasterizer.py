@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nsvq_lightning.compute.jit import thread_count
+from nsvq_lightning.compute.jit import parts_of
 from nsvq_lightning.compute.memory import Array, Workspace, flat, flat_checked, recycled
+from nsvq_lightning.compute.rows import vector_share
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import binning, projection, projection_backward
 from nsvq_lightning.rendering.cpu import blend as blending
@@ -18,7 +19,8 @@ from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats
 
-PROJECTION_SCRATCH = 2048 + 64
+# Fewer splats than these are not worth a part of their own.
+PROJECTED, SORTED = 2048, 8192
 
 
 class _Frame:
@@ -39,11 +41,10 @@ class _Frame:
         attributes = tuple(map(flat_checked, ATTRIBUTES, splats, shapes))
         self.geometry, self.colors = attributes[:4], attributes[4:]
         self.bands = 3 * coefficients, degree
-        self.threads = thread_count()
+        self.parts = parts_of(n, PROJECTED)
         self.work = Workspace.borrow()
         self.records = self.work.array("records", rec.RECORD * self.n)
         self.integers = self.records.view(np.int32)
-        self.scratch = self.work.rows("projection", self.threads, PROJECTION_SCRATCH)
         self.sums = np.empty(0, np.float32)
 
     def __del__(self) -> None:
@@ -52,13 +53,12 @@ class _Frame:
             work.give_back()
 
     def find(self) -> tuple[Array, Array, Array]:
-        """Write the records of the visible splats; returns a run of rows, and the rows and slots, of each thread."""
+        """Write the records of the visible splats; returns a run of rows, and the rows and slots, of each part."""
         found = self.work.array("found", self.n, np.int32)
-        counts, slots = (self.work.array(name, self.threads, np.int64) for name in ("counts", "slot_counts"))
+        counts, slots = (self.work.array(name, self.parts, np.int64) for name in ("counts", "slot_counts"))
         projection.project_splats(
-            self.threads, self.camera, self.sampling, *self.geometry, self.records, self.integers, found, counts,
-            slots, self.scratch,
-        )  # fmt: skip
+            self.parts, self.camera, self.sampling, *self.geometry, self.records, self.integers, found, counts, slots
+        )
         return found, counts, slots
 
     def project(self, means2d: Array, radii: Array) -> None:
@@ -70,24 +70,25 @@ class _Frame:
         order = self.work.array("order", self.count, np.int32)
         self.boxes = self.work.array("boxes", self.count, np.int64)
         listed = self.ids, keys, order, self.boxes
-        projection.join_runs(self.threads, (found, counts, slots), self.records, self.integers, listed, means2d, radii)
+        projection.join_runs(self.parts, (found, counts, slots), self.records, self.integers, listed, means2d, radii)
         projection.add_colors(
-            self.threads, self.camera, self.geometry[0], self.colors, self.bands, self.ids, self.count, self.records,
-            self.scratch,
-        )  # fmt: skip
+            self.parts, self.camera, self.geometry[0], self.colors, self.bands, self.ids, self.count, self.records
+        )
         if self.count:
             other = self.work.array("order2", self.count, np.int32)
             keys2 = self.work.array("keys2", self.count + 1, np.int32)
-            histogram = self.work.rows("digits", self.threads, binning.DIGITS, np.int64)
-            if binning.sort_by_depth(self.threads, self.count, keys, order, keys2, other, histogram):
+            parts = parts_of(self.count, SORTED)
+            histogram = self.work.rows("digits", parts, binning.DIGITS, np.int64)
+            if binning.sort_by_depth(parts, self.count, keys, order, keys2, other, histogram):
                 order = other
         self.order = order
 
     def bin(self) -> None:
         """List the splats of every tile, front to back."""
-        histogram = self.work.rows("tile_counts", self.threads, self.tiles, np.int64)
+        parts = parts_of(self.count, max(SORTED, 4 * self.tiles))
+        histogram = self.work.rows("tile_counts", parts, self.tiles, np.int64)
         self.offsets = self.work.array("offsets", self.tiles + 1, np.int64)
-        listed = self.threads, self.count, self.order, self.boxes, self.group_columns, histogram
+        listed = parts, self.count, self.order, self.boxes, self.group_columns, histogram
         total = binning.count_tiles(*listed, self.offsets)
         if total >= 2**31:
             raise RuntimeError(
@@ -143,9 +144,8 @@ class _Project(torch.autograd.Function):
         _check_kept(ctx.saved_tensors, ctx.shapes)
         gradients = [recycled(shape) for shape in ctx.shapes]
         projection_backward.project_backward(
-            frame.threads, frame.camera, frame.sampling, frame.geometry, frame.colors[1], frame.bands, frame.ids,
-            frame.count, frame.records, frame.integers, frame.sums, flat(g_means2d),
-            tuple(map(flat, gradients)), frame.scratch,
+            frame.parts, frame.camera, frame.sampling, frame.geometry, frame.colors[1], frame.bands, frame.ids,
+            frame.count, frame.records, frame.integers, frame.sums, flat(g_means2d), tuple(map(flat, gradients)),
         )  # fmt: skip
         return None, *gradients
 
@@ -157,19 +157,17 @@ class _Blend(torch.autograd.Function):
     def forward(ctx: Any, frame: _Frame, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
         _means2d, _token, background, pixel_weights, _absgrad = inputs
         shape = frame.size[::-1]
-        image, transmittance, depth, alpha = (recycled((*shape, *last)) for last in ((3,), (), (), ()))
+        planes = image, transmittance, depth, alpha = [recycled((*shape, *last)) for last in ((3,), (), (), ())]
         frame.bin()
         behind = flat_checked("background", background.contiguous(), (3,))
         blending.blend(
-            frame.threads, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.size, behind, _GRID,
-            frame.touched, frame.ends, (flat(image), flat(transmittance), flat(depth)),
-            frame.work.rows("blend", frame.threads, blending.FORWARD_SCRATCH), (is_on("blocks"), is_on("saturated")),
-            np.zeros(1, np.int64),
+            frame.tiles, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.size, behind, _GRID,
+            frame.touched, frame.ends, tuple(map(flat, planes)), (is_on("blocks"), is_on("saturated")),
         )  # fmt: skip
         ctx.frame = frame
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(image, transmittance, depth, pixel_weights)
-        return image, torch.sub(1, transmittance, out=alpha), depth
+        return image, alpha, depth
 
     @staticmethod
     @once_differentiable
@@ -183,17 +181,17 @@ class _Blend(torch.autograd.Function):
         g_image = torch.zeros_like(image) if g_image is None else g_image
         g_alpha = transmittance if g_alpha is None else g_alpha
         g_depth = depth if g_depth is None else g_depth
-        work = frame.work
         frame.clear_sums()
         g_means2d, g_absgrad = torch.zeros(frame.n, 2), torch.zeros(frame.n if with_absgrad else 0, 3)
+        first = frame.offsets[:: rec.GROUP_TILES]
+        order = np.argsort(first[:-1] - first[1:], kind="stable")
         blending.blend_backward(
-            frame.threads, frame.records, frame.integers, frame.entries, frame.offsets, frame.ends,
+            len(order), order, frame.records, frame.integers, frame.entries, frame.offsets, frame.ends,
             frame.group_columns, frame.size, _GRID, frame.touched, (flat(image), flat(transmittance), flat(depth)),
             (flat(g_image), flat(g_alpha), flat(g_depth)), pixel_weights, wanted, frame.sums,
-            work.rows("blend_backward", frame.threads, blending.BACKWARD_SCRATCH), np.zeros(1, np.int64),
         )  # fmt: skip
         blending.total_slots(
-            frame.threads, frame.ids, frame.count, frame.slots, frame.records, frame.integers, frame.sums,
+            frame.parts, frame.ids, frame.count, frame.slots, frame.records, frame.integers, frame.sums,
             flat(g_means2d), with_absgrad, flat(g_absgrad),
         )  # fmt: skip
         g_background = (g_image * transmittance[..., None]).sum((0, 1)) if ctx.needs_input_grad[3] else None
@@ -232,6 +230,6 @@ def visible(splats: RawSplats, camera: Camera) -> Tensor:
     """
     frame = _Frame(splats, camera, 0, None)
     found, counts, _ = frame.find()
-    starts = (rec.vector_share.py_func(frame.n, thread, frame.threads)[0] for thread in range(frame.threads))
+    starts = (vector_share.py_func(frame.n, part, frame.parts)[0] for part in range(frame.parts))
     runs = [found[start : start + count] for start, count in zip(starts, counts, strict=True)]
     return torch.from_numpy(np.concatenate(runs, dtype=np.int64))

@@ -98,16 +98,3 @@ def load_view(camera):
     slopes_x = simd.load_one(camera, LOW_X), simd.load_one(camera, HIGH_X)
     slopes_y = simd.load_one(camera, LOW_Y), simd.load_one(camera, HIGH_Y)
     return rotation, load3(camera, TRANSLATION), focal, slopes_x, slopes_y
-
-
-@inline
-def share(count, thread, threads):
-    """First and end of a thread's share of ``count`` things."""
-    return count * thread // threads, count * (thread + 1) // threads
-
-
-@inline
-def vector_share(count, thread, threads):
-    """The same of ``count`` splats: whole vectors, except for the very last one."""
-    vectors = (count + 15) // 16
-    return 16 * (vectors * thread // threads), min(count, 16 * (vectors * (thread + 1) // threads))

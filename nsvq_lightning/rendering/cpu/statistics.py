@@ -5,15 +5,15 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
-from nsvq_lightning.compute.jit import F, parallel, thread_count
+from nsvq_lightning.compute.jit import F, parallel, parts_of
 from nsvq_lightning.compute.memory import INT32, flat_checked
+from nsvq_lightning.compute.rows import share
 from nsvq_lightning.compute.simd import get, put
-from nsvq_lightning.rendering.cpu.records import share
 
 
 @parallel
-def _add(thread, threads, gradients, columns, radii, x_factor, y_factor, factor, sums, views, weights):
-    first, end = share(radii.shape[0], thread, threads)
+def _add(part, parts, gradients, columns, radii, x_factor, y_factor, factor, sums, views, weights):
+    first, end = share(radii.shape[0], part, parts)
     for i in range(first, end):
         if get(radii, i) > 0:
             x = x_factor * get(gradients, columns * i)
@@ -48,4 +48,4 @@ def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, factors
         factor = F(np.count_nonzero(positive) / total) if total > 0 else F(0)
     # The first table stands in for that of the weights, which is then not touched.
     changed = [flat_checked("a table", table, rows) for table in (tables if columns == 3 else [*tables, tables[0]])]
-    _add(thread_count(), given, columns, seen, x_factor, y_factor, factor, *changed)
+    _add(parts_of(len(seen), 8192), given, columns, seen, x_factor, y_factor, factor, *changed)
