@@ -8,7 +8,7 @@ from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.compute.jit import inline
+from nsvq_lightning.compute.jit import inline, parallel
 from nsvq_lightning.compute.memory import recycled
 from nsvq_lightning.compute.simd import get, put
 
@@ -61,6 +61,13 @@ def clear(array, first, last):
     """Zero a range of elements."""
     for i in range(first, last):
         put(array, i, 0)
+
+
+@parallel
+def clear_all(part, parts, table):
+    """Zero a table."""
+    first, last = share(table.shape[0], part, parts)
+    clear(table, first, last)
 
 
 @inline

@@ -13,7 +13,7 @@ import numpy as np
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel
-from nsvq_lightning.compute.rows import share
+from nsvq_lightning.compute.rows import clear_between, share
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.formulas import (
     ALPHA_MAX,
@@ -469,14 +469,20 @@ def blend_backward(
 
 
 @parallel
-def total_slots(part, parts, ids, count, slots, records, integers, sums, g_means2d, with_absgrad, absgrad):
+def total_slots(part, parts, ids, slots, records, integers, sums, g_means2d, with_absgrad, absgrad):
     """Add up the slots of each splat into its first one, and derive the gradient of the projected centre ``[N·2]``.
+
+    It is 0 for splats that are not visible.
 
     ``with_absgrad`` also writes sums over the pixels ``[N·3]``: Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · pixel weight.
     """
+    count = ids.shape[0]
     first, last = share(count, part, parts)
     for i in range(first, last):
         row = np.int64(simd.get(ids, i))
+        clear_between(ids, i, 2, g_means2d)
+        if with_absgrad:
+            clear_between(ids, i, 3, absgrad)
         r = rec.RECORD * row
         slot = np.int64(simd.get(integers, r + rec.SLOT))
         end = np.int64(slots)
@@ -496,3 +502,6 @@ def total_slots(part, parts, ids, count, slots, records, integers, sums, g_means
             simd.put(absgrad, 3 * row, abs(TWO_LN2 * a) * simd.get(sums, o + rec.ABS_X))
             simd.put(absgrad, 3 * row + 1, TWO_LN2 * simd.get(sums, o + rec.ABS_Y))
             simd.put(absgrad, 3 * row + 2, simd.get(sums, o + rec.SUM_WEIGHT))
+    if part == parts - 1:
+        clear_between(ids, count, 2, g_means2d)
+        clear_between(ids, count, 3, absgrad)

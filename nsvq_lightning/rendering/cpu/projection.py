@@ -4,7 +4,7 @@ import numpy as np
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel
-from nsvq_lightning.compute.rows import load_numbers, load_quats, load_vectors, vector_share
+from nsvq_lightning.compute.rows import clear, load_numbers, load_quats, load_vectors, vector_share
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import color_range
 from nsvq_lightning.rendering.formulas import footprint, view_point
@@ -95,15 +95,19 @@ def join_runs(part, parts, runs, records, integers, listed, means2d, radii):
 
     Also writes, by place in ``ids``, the depths as ``keys``, the places themselves as ``order`` and the tiles that a
     splat touches as ``boxes`` (first column and row, number of columns and rows, 16 bits each), and the projected
-    centres ``means2d [N·2]`` and ``radii [N]`` of the visible splats.
+    centres ``means2d [N·2]`` and ``radii [N]``, 0 for splats that are not visible.
     """
     found, counts, slots = runs
     ids, keys, order, boxes = listed
     total = counts.sum()
-    first, _ = vector_share(records.shape[0] // rec.RECORD, part, parts)
+    first, last = vector_share(radii.shape[0], part, parts)
+    unseen = first
     start, slot = counts[:part].sum(), slots[:part].sum()
     for k in range(counts[part]):
         row = np.int64(simd.get(found, first + k))
+        clear(means2d, 2 * unseen, 2 * row)
+        clear(radii, unseen, row)
+        unseen = row + 1
         o = rec.RECORD * row
         simd.put(ids, start + k, row)
         simd.put(integers, o + rec.SLOT, np.int64(simd.get(integers, o + rec.SLOT)) + slot)
@@ -115,6 +119,8 @@ def join_runs(part, parts, runs, records, integers, listed, means2d, radii):
         simd.put(means2d, 2 * row, simd.get(records, o + rec.X))
         simd.put(means2d, 2 * row + 1, simd.get(records, o + rec.Y))
         simd.put(radii, row, simd.get(integers, o + rec.RADIUS))
+    clear(means2d, 2 * unseen, 2 * last)
+    clear(radii, unseen, last)
     if start + counts[part] == total and counts[part] > 0:
         for k in range(16):
             simd.put(ids, total + k, simd.get(ids, total - 1))

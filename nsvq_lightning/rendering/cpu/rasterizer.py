@@ -9,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.jit import parts_of
 from nsvq_lightning.compute.memory import Array, Workspace, flat, flat_checked, recycled
-from nsvq_lightning.compute.rows import vector_share
+from nsvq_lightning.compute.rows import clear_all, vector_share
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import binning, projection, projection_backward
 from nsvq_lightning.rendering.cpu import blend as blending
@@ -20,7 +20,7 @@ from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats
 
 # Fewer splats than these are not worth a part of their own.
-PROJECTED, SORTED = 2048, 8192
+PROJECTED, SORTED = 2048, 4096
 
 
 class _Frame:
@@ -103,7 +103,7 @@ class _Frame:
     def clear_sums(self) -> None:
         """A slot of zeros for each pair of a splat and a group."""
         self.sums = self.work.array("sums", rec.RECORD * self.slots)
-        torch.from_numpy(self.sums).zero_()
+        clear_all(parts_of(self.slots, SORTED), self.sums)
 
 
 _GRID = blending.pixel_grid()
@@ -124,8 +124,7 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, frame: _Frame, *attributes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        means2d = attributes[0].new_zeros(frame.n, 2)
-        radii = torch.zeros(frame.n, dtype=torch.int32)
+        means2d, radii = recycled((frame.n, 2)), recycled((frame.n,)).view(torch.int32)
         ctx.frame, ctx.shapes = frame, [tensor.shape for tensor in attributes]
         ctx.save_for_backward(*attributes)
         frame.project(flat(means2d), flat(radii))
@@ -182,7 +181,7 @@ class _Blend(torch.autograd.Function):
         g_alpha = transmittance if g_alpha is None else g_alpha
         g_depth = depth if g_depth is None else g_depth
         frame.clear_sums()
-        g_means2d, g_absgrad = torch.zeros(frame.n, 2), torch.zeros(frame.n if with_absgrad else 0, 3)
+        g_means2d, g_absgrad = recycled((frame.n, 2)), recycled((frame.n if with_absgrad else 0, 3))
         first = frame.offsets[:: rec.GROUP_TILES]
         order = np.argsort(first[:-1] - first[1:], kind="stable")
         blending.blend_backward(
@@ -191,7 +190,7 @@ class _Blend(torch.autograd.Function):
             (flat(g_image), flat(g_alpha), flat(g_depth)), pixel_weights, wanted, frame.sums,
         )  # fmt: skip
         blending.total_slots(
-            frame.parts, frame.ids, frame.count, frame.slots, frame.records, frame.integers, frame.sums,
+            frame.parts, frame.ids[: frame.count], frame.slots, frame.records, frame.integers, frame.sums,
             flat(g_means2d), with_absgrad, flat(g_absgrad),
         )  # fmt: skip
         g_background = (g_image * transmittance[..., None]).sum((0, 1)) if ctx.needs_input_grad[3] else None
