@@ -316,7 +316,7 @@ def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, width: 
     """
     factors = 0.5 * width, 0.5 * height
     if kernels_for(gradients) == "cpu":
-        from nsvq_lightning.rendering.cpu.statistics import add_view as add_view_cpu
+        from nsvq_lightning.rendering.cpu.rasterizer import add_view as add_view_cpu
 
         add_view_cpu(tables, gradients, radii, factors)
         return

@@ -5,7 +5,6 @@ import gc
 import math
 import threading
 import weakref
-from bisect import bisect_right
 from contextlib import suppress
 from typing import Any
 
@@ -115,11 +114,6 @@ _SLACK = 4
 _PAGE = 1024
 
 
-def _count_free(size: float) -> int:
-    """How many free buffers, sorted from the largest on, have at least this size."""
-    return bisect_right(_FREE, -size, key=lambda buffer: -len(buffer))
-
-
 def recycled(shape: tuple[int, ...]) -> Tensor:
     """A float32 tensor with unspecified content, in memory whose previous tensor is gone.
 
@@ -128,14 +122,15 @@ def recycled(shape: tuple[int, ...]) -> Tensor:
     """
     size = math.prod(shape)
     with _LOCK:
-        # Tensors that end meanwhile, in whatever thread, append their memory, which is sorted in next time.
-        _FREE.sort(key=len, reverse=True)
-        large_enough = _count_free(size)
-        if large_enough > _count_free(_SLACK * size + _PAGE + 1):
-            buffer = _FREE.pop(large_enough - 1)  # the smallest, and of equal ones that which is still in the caches
+        # Tensors that end meanwhile, in whatever thread, append their memory. The smallest that is large enough, and of
+        # equal ones that which is still in the caches:
+        sizes = [(len(buffer), -place) for place, buffer in enumerate(_FREE)]
+        length, place = min((each for each in sizes if each[0] >= size), default=(-1, 0))
+        if size <= length <= _SLACK * size + _PAGE:
+            buffer = _FREE.pop(-place)
         else:
             # The number of splats grows: a buffer that is a little too small now will not be requested again.
-            del _FREE[large_enough : _count_free(size / 2)]
+            _FREE[:] = [buffer for buffer in _FREE if not size / 2 <= len(buffer) < size]
             buffer = aligned_empty((size + size // 8 + _PAGE,))
     view = buffer[:size].reshape(shape)  # which the tensor keeps alive
     weakref.finalize(view, _FREE.append, buffer)

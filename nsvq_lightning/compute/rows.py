@@ -45,18 +45,6 @@ load_numbers, load_vectors, load_quats = _loader(1, simd.load), _loader(3, simd.
 
 
 @inline
-def store_numbers(numbers, start, count, lanes):
-    """The inverse of ``load_numbers``."""
-    if count < 16:
-        padded = simd.scratch(16)
-        simd.store(padded, 0, lanes)
-        for k in range(count):
-            simd.put(numbers, start + k, simd.get(padded, k))
-    else:
-        simd.store(numbers, start, lanes)
-
-
-@inline
 def clear(array, first, last):
     """Zero a range of elements."""
     for i in range(first, last):

@@ -230,42 +230,24 @@ def prefetch(builder, array, offset):
     _llvm(builder, "prefetch.p0", [address, _i32(0), _i32(3), _i32(1)], ir.VoidType())
 
 
-_FLOATS = types.Array(types.float32, 1, "C")
-
-
-def _as_array(context, builder, address, size):
-    """Floats at an address, which nobody counts references to."""
-    array = context.make_array(_FLOATS)(context, builder)
-    data, stride = builder.bitcast(address, _f32.as_pointer()), _i64(4)
-    context.populate_array(array, data=data, shape=[size], strides=[stride], itemsize=stride, meminfo=None)
-    return array._getvalue()
-
-
 @intrinsic(prefer_literal=True)
 def scratch(typingctx, count):
     """``scratch(count)``: as many floats, a constant, of whatever content, on the stack: gone when the kernel ends."""
-    size = count.literal_value
+    kind, size = types.Array(types.float32, 1, "C"), count.literal_value
 
     def emit(context, builder, sig, values):
         with builder.goto_entry_block():
             memory = builder.alloca(ir.ArrayType(_f32, size))
         memory.align = 64
         # Hidden from LLVM: what it knew of it would decide what is contracted, and so the bits.
-        kind = memory.type
-        memory = builder.asm(ir.FunctionType(kind, [kind]), "", "=r,0", [memory], False)
-        return _as_array(context, builder, memory, _i64(size))
+        pointer = _f32.as_pointer()
+        data = builder.asm(ir.FunctionType(pointer, [pointer]), "", "=r,0", [builder.bitcast(memory, pointer)], False)
+        array = context.make_array(kind)(context, builder)
+        length, stride = _i64(size), _i64(4)
+        context.populate_array(array, data=data, shape=[length], strides=[stride], itemsize=stride, meminfo=None)
+        return array._getvalue()
 
-    return _FLOATS(count), emit
-
-
-@intrinsic
-def floats_at(typingctx, address):
-    """``floats_at(address)``: the floats there; how many is for the caller to know."""
-
-    def emit(context, builder, sig, values):
-        return _as_array(context, builder, builder.inttoptr(values[0], _i8.as_pointer()), _i64(0))
-
-    return _FLOATS(types.int64), emit
+    return kind(count), emit
 
 
 # ---- arithmetic

@@ -158,13 +158,6 @@ class SplatModule(LightningModule):
         self._late_losses: list[tuple[str, AsyncScalar]] = []
         self._view_of_step = 0
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Torch's, but that Lightning notes the name of a hook, fifty times a step, without a search for parameters."""
-        if name == "_current_fx_name":
-            vars(self)[name] = value
-        else:
-            super().__setattr__(name, value)
-
     @property
     def quantizers(self) -> Mapping[str, Quantizer]:
         """Quantizer by attribute; empty for a run without quantization."""

@@ -1,20 +1,13 @@
 """One Adam with a named parameter group per attribute and codebook, and the position's learning rate."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-import numpy as np
 import torch
 from torch import nn
-from torch.autograd.graph import increment_version
 
-from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.compute.jit import inline, parallel, parts_of
-from nsvq_lightning.compute.memory import check_tensor
-from nsvq_lightning.compute.rows import load_numbers, store_numbers, vector_share
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import Splats
 
@@ -135,94 +128,10 @@ def adapt_to_views(optimizer: torch.optim.Optimizer, rates: LearningRates, views
     return math.sqrt(scale)
 
 
-# Numbers in a vector of torch's Adam; those at the end that fill none are rounded in another order.
-WIDTH = 8
-
-
-@inline
-def _advance(places, factors, start, count, in_vector):
-    """Adam's update of 16 numbers of a parameter, or of fewer."""
-    values, gradient = simd.floats_at(places[0]), simd.floats_at(places[1])
-    first, second = simd.floats_at(places[2]), simd.floats_at(places[3])
-    g, m = load_numbers(gradient, start, count), load_numbers(first, start, count)
-    v, decay = load_numbers(second, start, count), factors[1]
-    m = simd.fma(factors[0], g - m, m)
-    part = factors[2] * g
-    v = simd.fma(part, g, v * decay) if in_vector else simd.fma(v, decay, part * g)
-    step = factors[5] * m / (simd.sqrt(v) / factors[3] + factors[4])
-    store_numbers(values, start, count, load_numbers(values, start, count) - step)
-    store_numbers(first, start, count, m)
-    store_numbers(second, start, count, v)
-
-
-@parallel
-def _update(part, parts, places, factors):
-    """Adam's update of a share of each parameter, with the bits of torch's.
-
-    ``places [P, 5]`` are the addresses of values, gradient and both moments, and how many numbers there are;
-    ``factors [P, 6]`` 1 - β₁, β₂, 1 - β₂, √(1 - β₂ᵗ), ε and the rate / (1 - β₁ᵗ), at iteration t.
-    """
-    for i in range(places.shape[0]):
-        size = places[i, 4]
-        begin, end = vector_share(size, part, parts)
-        whole = min(end, size - size % WIDTH)
-        for start in range(begin, whole, 16):
-            _advance(places[i], factors[i], start, min(16, whole - start), True)
-        if whole < end:
-            _advance(places[i], factors[i], whole, end - whole, False)
-
-
-class SplatAdam(torch.optim.Adam):
-    """torch's Adam, whose step on the CPU is one kernel for all parameters, with the same bits."""
-
-    @torch.no_grad()
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """Take a step (Kingma and Ba 2015, algorithm 1); parameters without a gradient stay.
-
-        Args:
-            closure: Computes gradients first, and returns the loss, which this returns.
-
-        Raises:
-            ValueError: A gradient or a moment does not fit its parameter.
-            TypeError: One has another dtype.
-        """
-        like = [group["params"][0] for group in self.param_groups]
-        others = any(group["weight_decay"] or group["amsgrad"] or group["maximize"] for group in self.param_groups)
-        if others or any(kernels_for(each) != "cpu" for each in like):
-            return super().step(closure)
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
-        places, factors = [], []
-        for group in self.param_groups:
-            beta1, beta2 = group["betas"]
-            for parameter in group["params"]:
-                if parameter.grad is None:
-                    continue
-                state = self.state[parameter]
-                if not state:
-                    state["step"] = torch.zeros(())
-                    state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-                tensors = parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"]
-                for tensor in tensors:
-                    check_tensor(group["name"], tensor, parameter.shape, parameter.device)
-                increment_version(parameter)
-                state["step"] += 1
-                done = float(state["step"])
-                rate, scale = group["lr"] / (1 - beta1**done), math.sqrt(1 - beta2**done)
-                places.append([*(tensor.data_ptr() for tensor in tensors), parameter.numel()])
-                factors.append([1 - beta1, beta2, 1 - beta2, scale, group["eps"], rate])
-        if places:
-            table = np.array(places)
-            _update(parts_of(table[:, 4].sum(), 1 << 15), table, np.array(factors, np.float32))
-        return loss
-
-
 def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
     """Adam of the paper over ``groups``: default betas, epsilon 1e-15, no weight decay; fused where torch can."""
     fused = all(group["params"][0].device.type in ("cpu", "cuda") for group in groups)
-    return SplatAdam(groups, eps=EPS, fused=True if fused else None)
+    return torch.optim.Adam(groups, eps=EPS, fused=True if fused else None)
 
 
 def find_group(optimizer: torch.optim.Optimizer, name: str) -> dict[str, Any]:

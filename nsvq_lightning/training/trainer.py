@@ -2,13 +2,11 @@
 
 import logging
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch import Callback, Trainer
-from lightning.pytorch.profilers import PassThroughProfiler
 from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.trainer import call
 
@@ -19,16 +17,6 @@ from nsvq_lightning.training.resume import PlainCheckpointIO, read_checkpoint
 from nsvq_lightning.version import check_replaced
 
 log = logging.getLogger(__name__)
-
-_NOTHING = nullcontext()
-
-
-class _NoProfiler(PassThroughProfiler):
-    """Lightning's, without a new context around each hook of each callback: a hundred a step."""
-
-    def profile(self, action_name: str) -> nullcontext[None]:  # type: ignore[override]
-        return _NOTHING
-
 
 check_replaced("lightning", call, "_call_callback_hooks")
 _call_all_hooks = call._call_callback_hooks
@@ -42,7 +30,7 @@ def _call_hooks(trainer: Trainer, hook: str, *args: Any, **kwargs: Any) -> None:
         _call_all_hooks(trainer, hook, *args, **kwargs)
 
 
-call._call_callback_hooks = _call_hooks
+call._call_callback_hooks = _call_hooks  # type: ignore[assignment]
 
 # What Lightning's trainer has otherwise.
 TRAINER_DEFAULTS: dict[str, Any] = {
@@ -75,7 +63,6 @@ class SplatTrainer(Trainer):
         self, *args: Any, run_folder: str | None = None, allow_other_scene: bool = False, **kwargs: Any
     ) -> None:
         kwargs = TRAINER_DEFAULTS | {"logger": False} | kwargs
-        kwargs["profiler"] = kwargs.get("profiler") or _NoProfiler()
         if kwargs.get("accelerator", "auto") == "auto":
             kwargs["accelerator"] = best_device().type
         several = "view_parallel_notebook" if hasattr(sys, "ps1") else "view_parallel"

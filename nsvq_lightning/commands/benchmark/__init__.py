@@ -10,6 +10,7 @@ Examples:
   nsvq benchmark all --quick
   nsvq benchmark render > render.md
   nsvq benchmark train --scene path/to/colmap/folder --switches all
+  nsvq benchmark train --scene path/to/colmap/folder --emulate 8,16
   nsvq benchmark quantize,codec --scene scene.ply
 """
 
@@ -20,7 +21,7 @@ import sys
 import time
 from pathlib import Path
 
-from nsvq_lightning.commands.arguments import positive, some_of
+from nsvq_lightning.commands.arguments import integers, positive, some_of
 from nsvq_lightning.skips import SKIPS
 
 # Modules of this package; each has a function ``run(scope)``, which returns measurements.
@@ -50,6 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--config", metavar="NAME", help="config of the runs of train (fast.yaml, without photos demo.yaml)")
     add("--steps", type=positive(int), metavar="N", help="iterations of each run of train (1000; quick 40)")
     add("--switches", type=some_of(SKIPS), metavar="NAME,NAME", help="switches that train inverts one by one, or all")
+    help_ = "numbers of cores, as 8,16: how long steps of train would take with so many, worked out on those there are"
+    add("--emulate", type=integers, metavar="N,N", help=help_)
     add = parser.add_argument_group("how much").add_argument
     add("--quick", action="store_true", help="small workloads, few repeats: all within a minute")
     add("--repeats", type=positive(int), metavar="N", help="timed calls of each case (15; quick 3)")
@@ -71,6 +74,8 @@ def run(options: argparse.Namespace) -> int:
     # Arguments are refused before torch is loaded.
     if steps is not None and steps < 4:
         raise argparse.ArgumentError(None, f"--steps must be at least 4, one for each phase, got {steps}")
+    if options.emulate is not None and (min(options.emulate) < 1 or options.suites != ("train",)):
+        raise argparse.ArgumentError(None, "--emulate takes numbers of cores, and is for the suite train alone")
     if options.init_from is not None and not (scene is not None and scene.is_dir()):
         raise argparse.ArgumentError(None, "--init-from needs a COLMAP folder as --scene, whose cameras see its splats")
     from nsvq_lightning.commands.benchmark.timing import Scope, as_markdown, describe_machine

@@ -37,6 +37,7 @@ class Scope:
             points.
         steps: Iterations of each run of ``train``, at least 4: a phase has one at least.
         switches: Names of :data:`nsvq_lightning.skips.SKIPS` that ``train`` inverts one by one.
+        emulate: Numbers of cores whose steps ``train`` works out.
         config: Config of the runs of ``train``; by default ``fast.yaml``, without photos ``demo.yaml``.
     """
 
@@ -48,6 +49,7 @@ class Scope:
     init_from: Path | None = None
     steps: int = 1000
     switches: tuple[str, ...] = ()
+    emulate: tuple[int, ...] = ()
     config: str | None = None
 
     @property

@@ -19,6 +19,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.commands.benchmark import timing
+from nsvq_lightning.commands.benchmark.emulation import Region, Regions, makespan
 from nsvq_lightning.commands.benchmark.timing import Measurement, Scope
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.commands.settings import find_config
@@ -74,6 +75,38 @@ class StepClock(Callback):
     def relative(self) -> float:
         """The mean step in matrix products, so that a busy machine is not mistaken for a slow variant."""
         return fmean(took for _, took in self.steps) / median(self.products)
+
+
+class RegionClock(StepClock):
+    """A clock that also keeps what kernels did in parallel in each step."""
+
+    def __init__(self, regions: Regions) -> None:
+        super().__init__()
+        self.regions = regions
+        self.kernels: list[list[Region]] = []
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the first step."""
+        self.regions.taken()
+        super().on_train_start(trainer, pl_module)
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *args: Any) -> None:
+        """End a step, and start the next."""
+        self.kernels.append(self.regions.taken())
+        super().on_train_batch_end(trainer, pl_module, outputs, *args)
+        self.regions.taken()
+
+    def expected(self, cores: int) -> StepClock:
+        """What a clock would show with so many cores; with 0, what lies between the kernels."""
+        clock = StepClock()
+        for (phase, took), kernels in zip(self.steps, self.kernels, strict=True):
+            seconds = took / 1000 - sum(whole for _, whole in kernels)
+            if cores:
+                waking = self.regions.wake * (cores > 1)
+                seconds += sum(makespan(units, cores) + waking for units, _ in kernels)
+            clock.steps.append((phase, 1000 * seconds))
+        clock.products, clock.psnr = self.products, self.psnr
+        return clock
 
 
 class _Run(SplatCLI):
@@ -141,10 +174,11 @@ def _config(scope: Scope) -> str:
 
 
 def run(scope: Scope) -> Iterator[Measurement]:
-    """Train as shipped, and without codebooks or with each inverted switch that is asked for."""
+    """Train as shipped, and without codebooks, with each inverted switch, or on each emulated number of cores."""
+    regions = Regions() if scope.emulate else None
     variants: dict[str, tuple[str, ...]] = {"as shipped": ()}
     variants |= {f"no skip of {name}": (f"--skips.{name}=false",) for name in scope.switches}
-    if not scope.switches:
+    if not (scope.switches or scope.emulate):
         variants["without codebooks"] = ("--model.codebooks=null",)
     # Not counted, through all phases: kernels are loaded, and compiled where they never were.
     _train(replace(scope, steps=8), StepClock())
@@ -155,9 +189,18 @@ def run(scope: Scope) -> Iterator[Measurement]:
     for turn in range(rounds):
         for name in order[turn:] + order[:turn]:
             splats[name] = _train(scope, clocks[name], variants[name])
-    shipped = clocks["as shipped"]
+    if regions is not None:
+        parts = RegionClock(regions)
+        regions.emulate(max(scope.emulate))
+        for _ in range(rounds):
+            count = _train(scope, parts)
+        regions.emulate(0)
+        for cores in (0, *scope.emulate):
+            name = f"{cores} cores, expected" if cores else "between kernels"
+            clocks[name], splats[name] = parts.expected(cores), count
     scene = "demo" if scope.photos is None else scope.photos.resolve().name
     described = f"{scene}, {Path(_config(scope)).name}, {scope.steps} steps"
+    shipped = clocks["as shipped"]
     for name, clock in clocks.items():
         samples = [took for _, took in clock.steps]
         values = {
