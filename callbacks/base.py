@@ -85,16 +85,12 @@ class SplatCallback(Callback):
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Call :meth:`before_step`."""
-        if type(self).before_step is SplatCallback.before_step:
-            return
         iteration = trainer.global_step + 1
         if first_time(self, "before", iteration):
             self.before_step(trainer, module, iteration)
 
     def on_train_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, *args: Any) -> None:
         """Call :meth:`after_step`."""
-        if type(self).after_step is SplatCallback.after_step:
-            return
         iteration = trainer.global_step
         if iteration and first_time(self, "after", iteration):
             self.after_step(trainer, module, iteration)

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.settings import check_config, find_config
@@ -356,9 +355,9 @@ CACHE_BYTES = 4 << 30
 
 
 def check_budget(scene: "Scene") -> Iterator[Finding]:
-    """Memory against what is available; time from steps with as many splats as two recipes make of the scene."""
+    """Memory against what is available; time from steps with as many splats as ``fast.yaml`` makes of the scene."""
     from nsvq_lightning.callbacks import BudgetedGrowth, PhaseSchedule, SplatBudget
-    from nsvq_lightning.callbacks.forecast import PAPER_SPLATS, iteration_seconds
+    from nsvq_lightning.callbacks.forecast import iteration_seconds
     from nsvq_lightning.callbacks.growth import splats_for_photos
     from nsvq_lightning.compute.devices import best_device
     from nsvq_lightning.data.scene import detailed_pixels
@@ -367,30 +366,21 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
     phases = PhaseSchedule(**fast["callbacks"]["phases"])
     wanted = SplatBudget(**fast["callbacks"]["budget"])
     growth = BudgetedGrowth()
-    default = splats_for_photos(len(scene.train), detailed_pixels(scene))
-    budget = round(wanted.quality * default)
-    paper = round(PAPER_SPLATS * default)
+    budget = splats_for_photos(len(scene.train), detailed_pixels(scene), wanted.quality)
+    most = round(growth.overshoot * budget)
     kept = min(scene.images.nbytes, CACHE_BYTES)  # the others are decoded each time
     needed = 1.2e9 + kept  # Python, torch, Lightning, compiled kernels and evaluations
-    needed += 59 * 4 * 6 * paper  # float32 of a splat, each with gradient, two moments, and copies while editing
+    needed += 59 * 4 * 6 * most  # float32 of a splat, each with gradient, two moments, and copies while editing
     # Buffers of the renderer, the loss and the picture itself.
     needed += 100 * max(camera.width * camera.height for camera in scene.cameras)
-    text = f"about {readable_bytes(needed)} with {paper:,} splats and {readable_bytes(kept)} of photos"
+    text = f"about {readable_bytes(needed)} with {most:,} splats and {readable_bytes(kept)} of photos"
     free = available_memory()
     advice = f"{readable_bytes(free or 0)} are available; lower --data.max_width or --data.cache_bytes"
     yield judged("run memory", text, advice, when=free is not None and needed > free)
     steps = phases.limited(fast["trainer"]["max_steps"], len(scene.train))
-    paper_steps = check_config(find_config("paper"))["trainer"]["max_steps"]
     parts = growth.stretches(phases.schedule(steps), round(wanted.start * budget), budget)
-    recipes = tqdm([parts, [(1.0, paper)]], "timing steps of training", leave=False, disable=None)
-    step, paper_step = (iteration_seconds(scene, each, best_device()) for each in recipes)
-    most = round(growth.overshoot * budget)
-    text = (
-        f"about {steps * step / 60:.0f} min for fast.yaml ({steps:,} steps, up to {most:,} splats), "
-        f"{paper_steps * paper_step / 3600:.1f} h for the paper's run ({paper_steps:,}, {paper:,}), "
-        "on a machine as busy as now"
-    )
-    yield Finding("good", "run time", text)
+    minutes = steps * iteration_seconds(scene, parts, best_device()) / 60
+    yield Finding("good", "run time", f"about {minutes:.0f} min for fast.yaml, on a machine as busy as now")
 
 
 def readable_bytes(count: float) -> str:

@@ -243,8 +243,8 @@ def scratch(typingctx, count):
         pointer = _f32.as_pointer()
         data = builder.asm(ir.FunctionType(pointer, [pointer]), "", "=r,0", [builder.bitcast(memory, pointer)], False)
         array = context.make_array(kind)(context, builder)
-        length, stride = _i64(size), _i64(4)
-        context.populate_array(array, data=data, shape=[length], strides=[stride], itemsize=stride, meminfo=None)
+        stride = _i64(4)
+        context.populate_array(array, data=data, shape=[_i64(size)], strides=[stride], itemsize=stride, meminfo=None)
         return array._getvalue()
 
     return kind(count), emit

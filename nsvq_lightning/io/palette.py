@@ -1,7 +1,6 @@
 """Few rows, or numbers, that represent many: of cells of similar ones, always the one is cut where that gains most."""
 
 import heapq
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,40 +9,6 @@ from numpy.typing import NDArray
 from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import check_array, check_table
 from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s, Integers, Uint8s
-
-# From start and end of a cell of two numbers or more, how much a cut gains, and after how many of them.
-_BestCut = Callable[[int, int], tuple[float, int]]
-
-
-def _cells(best_cut: _BestCut, size: int, count: int) -> list[tuple[int, int]]:
-    """Start and end of at most ``count`` cells of ``size`` numbers, cut out of one cell of all."""
-    heap: list[tuple[float, int, int, int]] = []
-
-    def add(start: int, end: int) -> None:
-        gain, place = best_cut(start, end) if end - start > 1 else (-1.0, 0)
-        heapq.heappush(heap, (-gain, start, start + place, end))
-
-    add(0, size)
-    while len(heap) < count and heap[0][0] <= 0:
-        _, start, cut, end = heapq.heappop(heap)
-        add(start, cut)
-        add(cut, end)
-    return [(start, end) for _, start, _, end in heap]
-
-
-def _best(left: Float64s, right: Float64s, left_sum: Float64s, right_sum: Float64s, mass: float) -> tuple[float, int]:
-    """How much the sum of squares of a cell falls at most if it is cut in two, -1 if it does not fall, and where.
-
-    Args:
-        left: Mass left of each place where it may be cut.
-        right: Mass right of it.
-        left_sum: Sum of the numbers left of it, times their mass.
-        right_sum: Sum right of it.
-        mass: Of the cell.
-    """
-    gains = np.square(left_sum / left - right_sum / right) * (left * right / mass)
-    best = int(gains.argmax())
-    return float(gains[best]) or -1.0, 1 + best  # equal numbers gain nothing
 
 
 def find_palette(rows: Float32s, weight: NDArray[np.number[Any]], count: int) -> tuple[Float32s, Int64s]:
@@ -71,18 +36,32 @@ def find_palette(rows: Float32s, weight: NDArray[np.number[Any]], count: int) ->
     check_array("weight", wide, rows.shape[:1], wide.dtype)
     order = np.arange(len(rows))
 
-    def best_cut(start: int, end: int) -> tuple[float, int]:
-        numbers = order[start:end]
-        along = np.empty(end - start)
-        _place_along(rows, wide, numbers, along)
-        ranks = along.argsort(kind="stable")
-        numbers[:] = numbers[ranks]
-        mass = wide[numbers].cumsum()
-        sums = (wide[numbers] * along[ranks]).cumsum()
-        return _best(mass[:-1], mass[-1] - mass[:-1], sums[:-1], sums[-1] - sums[:-1], mass[-1])
+    heap: list[tuple[float, int, int, int]] = []
 
+    def add(start: int, end: int) -> None:
+        """Find how much the sum of squares of a cell falls at most if it is cut in two, and where."""
+        gain, cut = -1.0, start
+        if end - start > 1:
+            numbers = order[start:end]
+            along = np.empty(end - start)
+            _place_along(rows, wide, numbers, along)
+            ranks = along.argsort(kind="stable")
+            numbers[:] = numbers[ranks]
+            masses = wide[numbers].cumsum()
+            sums = (wide[numbers] * along[ranks]).cumsum()
+            left, right = masses[:-1], masses[-1] - masses[:-1]
+            gains = np.square(sums[:-1] / left - (sums[-1] - sums[:-1]) / right) * (left * right / masses[-1])
+            best = int(gains.argmax())
+            gain, cut = float(gains[best]) or -1.0, start + 1 + best  # equal numbers gain nothing
+        heapq.heappush(heap, (-gain, start, cut, end))
+
+    add(0, len(rows))
+    while len(heap) < count and heap[0][0] <= 0:
+        _, start, cut, end = heapq.heappop(heap)
+        add(start, cut)
+        add(cut, end)
     labels = np.empty(len(rows), np.int64)
-    for number, (start, end) in enumerate(_cells(best_cut, len(rows), count)):
+    for number, (_, start, _, end) in enumerate(heap):
         labels[order[start:end]] = number
     mass = np.bincount(labels, wide)
     means = [np.bincount(labels, wide * column) / mass for column in rows.T]
@@ -187,22 +166,17 @@ def scalar_kmeans(values: Float32s, weight: Integers | int = 1, count: int = 256
     mass = mass[mass > 0]
     if len(numbers) <= count:
         return np.pad(numbers, (0, count - len(numbers)), "edge").astype(np.float32)
+    _, cells = find_palette(numbers.astype(np.float32)[:, None], mass, count)
+    starts = np.flatnonzero(np.diff(cells, prepend=-1))
     middle = float(np.average(numbers, weights=mass))  # sums of differences from it lose no digits
     mass = np.concatenate([[0.0], mass.cumsum()])
     sums = np.concatenate([[0.0], (np.diff(mass) * (numbers - middle)).cumsum()])
-
-    def best_cut(start: int, end: int) -> tuple[float, int]:
-        cuts = slice(start + 1, end)
-        left = mass[cuts] - mass[start]
-        right = mass[end] - mass[cuts]
-        return _best(left, right, sums[cuts] - sums[start], sums[end] - sums[cuts], mass[end] - mass[start])
 
     def means(ends: Integers, empty: Float64s) -> Float64s:
         """Means ``[C]`` of the cells between ``ends [C + 1]``; for a cell without values, that of ``empty [C]``."""
         inside = np.diff(mass[ends])
         return np.where(inside > 0, np.diff(sums[ends]) / np.where(inside > 0, inside, 1) + middle, empty)
 
-    starts = sorted(start for start, _ in _cells(best_cut, len(numbers), count))
     levels = means(np.array([*starts, len(numbers)]), np.zeros(count))
     for _ in range(500):  # each costs one search of 256 borders, whatever the number of values
         borders = np.searchsorted(numbers, _borders(levels))

@@ -6,31 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from lightning.fabric.plugins import TorchCheckpointIO
-from lightning.pytorch import Callback, Trainer
+from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import DDPStrategy
-from lightning.pytorch.trainer import call
 
 from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import PlainCheckpointIO, read_checkpoint
-from nsvq_lightning.version import check_replaced
 
 log = logging.getLogger(__name__)
 
-check_replaced("lightning", call, "_call_callback_hooks")
-_call_all_hooks = call._call_callback_hooks
-
-
-def _call_hooks(trainer: Trainer, hook: str, *args: Any, **kwargs: Any) -> None:
-    """Lightning's, unless no callback does anything there: four of the six hooks of a step, twenty callbacks each."""
-    empty = getattr(Callback, hook)
-    callbacks = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
-    if any(getattr(getattr(each, hook), "__func__", None) is not empty for each in callbacks):
-        _call_all_hooks(trainer, hook, *args, **kwargs)
-
-
-call._call_callback_hooks = _call_hooks  # type: ignore[assignment]
 
 # What Lightning's trainer has otherwise.
 TRAINER_DEFAULTS: dict[str, Any] = {

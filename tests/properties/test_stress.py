@@ -6,12 +6,12 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
+import nsvq_step
 import numpy as np
 import pytest
 import torch
 from extremes import BACKENDS, BROKEN_ROWS, extremes, quantizer_errors, quantizers, step, stress_errors, stress_table
 
-from nsvq_lightning.commands.benchmark import quantize
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.rasterize import render
@@ -65,7 +65,7 @@ def test_a_quantizer_with_nothing_to_do_or_to_choose(name: str) -> None:
     assert values["not finite"] == values["wrong codes"] == 0
     assert values["gradient error"] < 1e-5
     assert values["length error"] < 1e-4
-    quantized, gradient, _ = quantize.step({name: attribute}, 0)[name]
+    quantized, gradient, _ = nsvq_step.step({name: attribute}, 0)[name]
     if name in ("every row on a code", "more codes than rows", "all rows equal"):
         # Without a residual there is no noise, and the gradient passes as it is.
         assert torch.equal(quantized, attribute.x)

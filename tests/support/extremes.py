@@ -11,12 +11,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
+from nsvq_step import Attribute, step_errors
+from nsvq_step import step as quantize_step
 from splat_scenes import front_camera, random_splats
 from torch import Tensor
 
 from nsvq_lightning.commands import markdown_table
-from nsvq_lightning.commands.benchmark.quantize import Attribute, step_errors
-from nsvq_lightning.commands.benchmark.quantize import step as quantize_step
 from nsvq_lightning.commands.benchmark.render import Painter, errors_of, painted, trace
 from nsvq_lightning.commands.benchmark.timing import number
 from nsvq_lightning.commands.benchmark.workloads import Workload

@@ -2,7 +2,7 @@
 
 Suites:
   render     back-ends of the rasterizer and of the loss, forward and backward, against float64
-  quantize   a step of NSVQ, and the search for the nearest code
+  quantize   the search for the nearest code
   codec      writing and reading scene files
   train      whole runs, with switches on and off
 
@@ -51,8 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--config", metavar="NAME", help="config of the runs of train (fast.yaml, without photos demo.yaml)")
     add("--steps", type=positive(int), metavar="N", help="iterations of each run of train (1000; quick 40)")
     add("--switches", type=some_of(SKIPS), metavar="NAME,NAME", help="switches that train inverts one by one, or all")
-    help_ = "numbers of cores, as 8,16: how long steps of train would take with so many, worked out on those there are"
-    add("--emulate", type=integers, metavar="N,N", help=help_)
+    add("--emulate", type=integers, metavar="N,N", help="cores: how long steps of train would take with so many")
     add = parser.add_argument_group("how much").add_argument
     add("--quick", action="store_true", help="small workloads, few repeats: all within a minute")
     add("--repeats", type=positive(int), metavar="N", help="timed calls of each case (15; quick 3)")

@@ -13,7 +13,6 @@ from nsvq_lightning.commands.benchmark.timing import Measurement, Scope, compare
 from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.io.formats import load, save
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
-from nsvq_lightning.quantize.codebook import as_quantizer
 from nsvq_lightning.training.splat_scene import to_compressed
 
 
@@ -27,8 +26,7 @@ def run(scope: Scope) -> Iterator[Measurement]:
 def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Measurement]:
     splats = workload.splats
     # Codebooks of one step of k-means: sizes and times do not depend on how good they are.
-    fitted = quantize.prepare(splats, scope.codebooks)
-    scene = to_compressed(splats, {name: as_quantizer(each.quantizer) for name, each in fitted.items()})
+    scene = to_compressed(splats, quantize.prepare(splats, scope.codebooks))
     writers = {".ply": partial(save, splats)}
     writers |= {f".nsvq {level}": partial(save, scene, storage=Storage(level)) for level in LEVELS}
     look = torch.no_grad()(partial(painted, "auto"))

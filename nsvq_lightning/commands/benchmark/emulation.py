@@ -19,15 +19,13 @@ from llvmlite import binding
 from nsvq_lightning.compute import jit
 from nsvq_lightning.compute.rows import clear_all
 
-# Seconds of each unit of a kernel that was run unit by unit, and of the kernel as a whole.
+# Seconds of each part of a kernel that was run part by part, and of the kernel as a whole.
 Region = tuple[list[float], float]
 
 # Name of the function, and its arguments: share, base, counts, steps, state; two numbers, threads.
 PARALLEL_FOR = "numba_parallel_for"
 _FOR = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 5, *[ctypes.c_int64] * 3)
 _SHARE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4)
-# Parts of a kernel with many are timed together: to time one takes a microsecond.
-MAX_UNITS = 256
 # Modules that make as many parts as there are threads.
 BY_THREADS = ("nsvq_lightning.quality.ssim_cpu", "nsvq_lightning.quantize.kmeans")
 
@@ -53,7 +51,7 @@ class Regions:
         binding.add_symbol(PARALLEL_FOR, ctypes.cast(self._timed, ctypes.c_void_p).value)
         self.wake = median(whole for _, whole in self._idle())
         self._one_by_one = True
-        self._call = median(units[0] for units, _ in self._idle())
+        self._call = median(seconds[0] for seconds, _ in self._idle())
         self._one_by_one = False
 
     def _idle(self) -> list[Region]:
@@ -75,24 +73,22 @@ class Regions:
 
     def _run(self, share: int, base: int, counts: int, steps: int, state: int, *numbers: int) -> None:
         start = time.perf_counter()
-        units = []
+        seconds = []
         if self._one_by_one:
             fields = ctypes.cast(state, ctypes.POINTER(ctypes.c_int64))
-            parts = fields[jit.PARTS]
-            together = -(-parts // MAX_UNITS)
-            for first in range(0, parts, together):
-                fields[jit.NEXT], fields[jit.END] = first, min(parts, first + together)
+            for part in range(fields[jit.PARTS]):
+                fields[jit.NEXT], fields[jit.END] = part, part + 1
                 began = time.perf_counter()
                 _SHARE(share)(base, counts, steps, state)
-                units.append(max(0.0, time.perf_counter() - began - self._call))
+                seconds.append(max(0.0, time.perf_counter() - began - self._call))
         else:
             self._plain(share, base, counts, steps, state, *numbers)
-        self.seen.append((units, time.perf_counter() - start))
+        self.seen.append((seconds, time.perf_counter() - start))
 
 
-def makespan(units: Sequence[float], cores: int) -> float:
-    """When the last of some cores is done, each of which takes the next unit when it is done with one."""
+def makespan(seconds: Sequence[float], cores: int) -> float:
+    """When the last of some cores is done, each of which takes the next part when it is done with one."""
     busy = [0.0] * cores
-    for unit in units:
-        heapq.heapreplace(busy, busy[0] + unit)
+    for each in seconds:
+        heapq.heapreplace(busy, busy[0] + each)
     return max(busy)

@@ -94,7 +94,6 @@ class RegionClock(StepClock):
         """End a step, and start the next."""
         self.kernels.append(self.regions.taken())
         super().on_train_batch_end(trainer, pl_module, outputs, *args)
-        self.regions.taken()
 
     def expected(self, cores: int) -> StepClock:
         """What a clock would show with so many cores; with 0, what lies between the kernels."""
@@ -103,7 +102,7 @@ class RegionClock(StepClock):
             seconds = took / 1000 - sum(whole for _, whole in kernels)
             if cores:
                 waking = self.regions.wake * (cores > 1)
-                seconds += sum(makespan(units, cores) + waking for units, _ in kernels)
+                seconds += sum(makespan(parts, cores) + waking for parts, _ in kernels)
             clock.steps.append((phase, 1000 * seconds))
         clock.products, clock.psnr = self.products, self.psnr
         return clock
@@ -174,30 +173,24 @@ def _config(scope: Scope) -> str:
 
 
 def run(scope: Scope) -> Iterator[Measurement]:
-    """Train as shipped, and without codebooks, with each inverted switch, or on each emulated number of cores."""
+    """Train as shipped, with each inverted switch that is asked for, and on each emulated number of cores."""
     regions = Regions() if scope.emulate else None
     variants: dict[str, tuple[str, ...]] = {"as shipped": ()}
     variants |= {f"no skip of {name}": (f"--skips.{name}=false",) for name in scope.switches}
-    if not (scope.switches or scope.emulate):
-        variants["without codebooks"] = ("--model.codebooks=null",)
     # Not counted, through all phases: kernels are loaded, and compiled where they never were.
     _train(replace(scope, steps=8), StepClock())
     clocks = {name: StepClock() for name in variants}
-    splats = {}
-    order = list(variants)
     rounds = 1 if scope.quick else 2
-    for turn in range(rounds):
-        for name in order[turn:] + order[:turn]:
-            splats[name] = _train(scope, clocks[name], variants[name])
+    for name in [*variants, *reversed(variants)][: rounds * len(variants)]:
+        splats = _train(scope, clocks[name], variants[name])
     if regions is not None:
         parts = RegionClock(regions)
         regions.emulate(max(scope.emulate))
         for _ in range(rounds):
-            count = _train(scope, parts)
+            _train(scope, parts)
         regions.emulate(0)
-        for cores in (0, *scope.emulate):
-            name = f"{cores} cores, expected" if cores else "between kernels"
-            clocks[name], splats[name] = parts.expected(cores), count
+        clocks |= {"between kernels": parts.expected(0)}
+        clocks |= {f"{cores} cores, expected": parts.expected(cores) for cores in scope.emulate}
     scene = "demo" if scope.photos is None else scope.photos.resolve().name
     described = f"{scene}, {Path(_config(scope)).name}, {scope.steps} steps"
     shipped = clocks["as shipped"]
@@ -208,7 +201,7 @@ def run(scope: Scope) -> Iterator[Measurement]:
             "seconds": sum(samples) / 1000 / rounds,
             "times as shipped": clock.relative / shipped.relative,
             **clock.by_phase,
-            "splats": float(splats[name]),
+            "splats": float(splats),
         }
         if name.startswith("no skip"):
             values["saves %"] = 100 * (1 - shipped.relative / clock.relative)

@@ -300,16 +300,11 @@ def blend(tile, tiles, records, entries, offsets, group_columns, size, backgroun
     ``size`` is width and height, ``planes`` are image, transmittance, depth and alpha. ``skips`` says whether to skip
     the blocks that a splat cannot reach, and those whose pixels are all closed.
     """
-    corner = tile_corner(tile, group_columns)
     begin, end = np.int64(offsets[tile]), np.int64(offsets[tile + 1])
-    if corner[0] < size[0] and corner[1] < size[1]:
-        end = blend_tile(
-            records, entries, begin, end, corner, size, background, grid, touched, planes,
-            simd.scratch(FORWARD_SCRATCH), skips,
-        )  # fmt: skip
-    else:
-        end = begin
-    ends[tile] = end
+    ends[tile] = blend_tile(
+        records, entries, begin, end, tile_corner(tile, group_columns), size, background, grid, touched, planes,
+        simd.scratch(FORWARD_SCRATCH), skips,
+    )  # fmt: skip
 
 
 @inline

@@ -237,16 +237,17 @@ def visible(splats: RawSplats, camera: Camera) -> Tensor:
 
 
 @parallel
-def _add(part, parts, gradients, columns, radii, x_factor, y_factor, factor, sums, views, weights):
+def _add(part, parts, tables, gradients, radii, factors):
+    sums, views, weights, columns = tables[0], tables[1], tables[-1], len(tables)
     first, end = share(radii.shape[0], part, parts)
     for i in range(first, end):
         if get(radii, i) > 0:
-            x = x_factor * get(gradients, columns * i)
-            y = y_factor * get(gradients, columns * i + 1)
+            x = factors[0] * get(gradients, columns * i)
+            y = factors[1] * get(gradients, columns * i + 1)
             put(sums, i, get(sums, i) + np.sqrt(x * x + y * y))
             put(views, i, get(views, i) + F(1))
             if columns == 3 and get(gradients, 3 * i + 2) > 0:
-                put(weights, i, get(weights, i) + factor * get(gradients, 3 * i + 2))
+                put(weights, i, get(weights, i) + factors[2] * get(gradients, 3 * i + 2))
 
 
 def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, factors: tuple[float, float]) -> None:
@@ -266,11 +267,9 @@ def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, factors
     rows, columns = tuple(radii.shape[:1]), len(tables)
     given = flat_checked("gradients", gradients.contiguous(), (*rows, columns))
     seen = flat_checked("radii", radii, rows, INT32)
-    x_factor, y_factor, factor = F(factors[0]), F(factors[1]), F(0)
-    if columns == 3:  # one thread adds up, and so to the same bits for any number of them
-        positive = np.fmax(given[2::3], 0)
-        total = positive.sum(dtype=np.float64)
-        factor = F(np.count_nonzero(positive) / total) if total > 0 else F(0)
-    # The first table stands in for that of the weights, which is then not touched.
-    changed = [flat_checked("a table", table, rows) for table in (tables if columns == 3 else [*tables, tables[0]])]
-    _add(parts_of(len(seen), 8192), given, columns, seen, x_factor, y_factor, factor, *changed)
+    # One thread adds up, and so to the same bits for any number of them.
+    positive = np.fmax(given[2::3] if columns == 3 else given[:0], 0)
+    total = positive.sum(dtype=np.float64)
+    by_weight = np.count_nonzero(positive) / total if total > 0 else 0.0
+    changed = tuple(flat_checked("a table", table, rows) for table in tables)
+    _add(parts_of(len(seen), 8192), changed, given, seen, (*map(F, factors), F(by_weight)))

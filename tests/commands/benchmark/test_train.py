@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import nsvq_step
 import pytest
 import torch
 
@@ -75,11 +76,9 @@ def test_image_errors_leave_out_a_flipped_pixel_and_count_it() -> None:
     assert set(render.image_errors(truth, truth)[0].values()) == {0}
 
 
-def test_quantizer_and_search_are_right(scene: Path) -> None:
+def test_searches_are_right(scene: Path) -> None:
     rows = list(quantize.run(_tiny(scene=scene)))
-    values = _checked(rows)
-    assert values[quantize.STEP, "NSVQ"]["gradient error"] < 1e-4
-    assert values[quantize.STEP, "NSVQ"]["length error"] < 1e-5
+    _checked(rows)
     # Codes may differ between equals to rounding.
     ours = [row.values["added distance"] for row in rows if row.method == "nsvq_lightning"]
     assert len(ours) == 4
@@ -95,9 +94,9 @@ def test_codes_are_judged_by_their_distances() -> None:
 
 def test_wrong_quantize_step_is_found() -> None:
     splats = RawSplats(*(tensor[:2000] for tensor in synthetic_workload("A20k").splats))
-    attributes = quantize.prepare(splats, "0.5k")
-    results = quantize.step(attributes, 0)
-    assert max(quantize.step_errors(attributes, results).values()) < 1e-4
+    attributes = nsvq_step.prepare(splats, "0.5k")
+    results = nsvq_step.step(attributes, 0)
+    assert max(nsvq_step.step_errors(attributes, results).values()) < 1e-4
     quantized, gradient, codes = results["quats"]
     table, rows, upstream = attributes["quats"].x.detach(), attributes["quats"].rows, attributes["quats"].upstream
     x, straight_through = table[rows], torch.zeros_like(table).index_copy(0, rows, upstream)
@@ -106,7 +105,7 @@ def test_wrong_quantize_step_is_found() -> None:
         ((quantized, straight_through, codes), "gradient error"),
         ((quantized, gradient, codes.roll(1)), "wrong codes"),
     ):
-        assert quantize.step_errors(attributes, {**results, "quats": broken})[key] > 1e-3
+        assert nsvq_step.step_errors(attributes, {**results, "quats": broken})[key] > 1e-3
 
 
 def test_files_lose_what_their_levels_say(scene: Path, demo_scene: Path) -> None:
