@@ -37,6 +37,9 @@ _OPTIONS: dict[str, Any] = {
     "nogil": True,
     "no_cfunc_wrapper": True,
 }
+# What all threads see of a kernel: number of parts; the next one, and where to end; sum of what the calls return;
+# number of those that failed; arguments.
+PARTS, NEXT, END, SUM, FAILURES, ARGUMENTS = range(6)
 _byte_p, _i64 = ir.IntType(8).as_pointer(), ir.IntType(64)
 
 
@@ -145,9 +148,6 @@ def kernel(function: Callable[..., Any], allocates: bool = True) -> Any:
     return dispatcher
 
 
-# What all threads see of a kernel: number of parts; the next one, and where to end; sum of what the calls return;
-# number of those that failed; arguments.
-PARTS, NEXT, END, SUM, FAILURES, ARGUMENTS = range(6)
 # What Numba's threads call; the last argument is the state.
 _RANGE = ir.FunctionType(ir.VoidType(), [_byte_p.as_pointer(), _i64.as_pointer(), _i64.as_pointer(), _byte_p])
 _PARALLEL_FOR = ir.FunctionType(ir.VoidType(), [_byte_p] * 5 + [_i64] * 3)

@@ -198,7 +198,7 @@ class CodebookQuantizer(nn.Module, ABC):
     @torch.no_grad()
     def count(self, codes: Tensor) -> None:
         """Count one iteration in which ``codes [N]`` were hit."""
-        self.usage += torch.bincount(codes, minlength=len(self.usage)) > 0
+        self.usage += torch.zeros_like(self.usage).index_fill_(0, codes, 1)
         self.window += 1
 
     def reset_usage(self) -> None:

@@ -150,9 +150,9 @@ def test_the_estimate_of_a_run_is_measured(demo_scene: Path, monkeypatch: pytest
     # With a millisecond for each splat, instead of what a busy machine takes:
     monkeypatch.setattr(forecast, "step_seconds", lambda scene, count, device: count / 1000)
     _, time = doctor.check_budget(scene)
-    found = re.search(r"about (\d+) min .* ([\d.]+) h for the paper", time.text)
+    found = re.search(r"about (\d+) min", time.text)
     assert found is not None
-    assert 1 < int(found[1]) / 60 < float(found[2])
+    assert int(found[1]) > 60
     monkeypatch.setattr(doctor, "available_memory", lambda: 10**9)
     assert "max_width" in next(doctor.check_budget(scene)).text
 

@@ -111,6 +111,8 @@ def test_no_command_is_an_error_that_shows_them(capsys: pytest.CaptureFixture[st
         (["sweep", "--output={folder}", "--scenes", "a", "b"], "a list has commas between its entries, and no spaces"),
         (["benchmark", "train,rendre"], "choose some of render, quantize, codec, train, or all, got 'train,rendre'"),
         (["benchmark", "train", "--switches", "blocks,blokcs"], "got 'blocks,blokcs'"),
+        (["benchmark", "train", "--emulate", "8,0"], "takes numbers of cores"),
+        (["benchmark", "all", "--emulate", "8"], "is for the suite train alone"),
         (["benchmark", "render", "--init-from", "scene.ply"], "needs a COLMAP folder"),
         (["sweep", "--output={folder}", "--seeds", "1,two"], "got '1,two'"),
         (["benchmark", "render", "--repeats", "0"], "argument --repeats: must be above 0, got 0"),

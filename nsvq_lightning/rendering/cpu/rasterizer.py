@@ -21,8 +21,8 @@ from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats
 
-# Fewer splats than these are not worth a part of their own.
-PROJECTED, SORTED = 2048, 4096
+# Fewer splats than these are not worth a part of their own: to wake a thread takes a tenth of a millisecond.
+PROJECTED, LISTED, SORTED = 2048, 4096, 65_536
 
 
 class _Frame:
@@ -87,7 +87,7 @@ class _Frame:
 
     def bin(self) -> None:
         """List the splats of every tile, front to back."""
-        parts = parts_of(self.count, max(SORTED, 4 * self.tiles))
+        parts = parts_of(self.count, max(LISTED, 4 * self.tiles))
         histogram = self.work.rows("tile_counts", parts, self.tiles, np.int64)
         self.offsets = self.work.array("offsets", self.tiles + 1, np.int64)
         listed = parts, self.count, self.order, self.boxes, self.group_columns, histogram
@@ -272,4 +272,4 @@ def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, factors
     total = positive.sum(dtype=np.float64)
     by_weight = np.count_nonzero(positive) / total if total > 0 else 0.0
     changed = tuple(flat_checked("a table", table, rows) for table in tables)
-    _add(parts_of(len(seen), 8192), changed, given, seen, (*map(F, factors), F(by_weight)))
+    _add(parts_of(len(seen), SORTED), changed, given, seen, (*map(F, factors), F(by_weight)))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +15,7 @@ import torch
 
 from nsvq_lightning import save
 from nsvq_lightning.commands.benchmark import codec, quantize, render, timing, train
+from nsvq_lightning.commands.benchmark.emulation import makespan
 from nsvq_lightning.commands.benchmark.timing import Measurement, Scope
 from nsvq_lightning.commands.benchmark.workloads import synthetic_workload
 from nsvq_lightning.skips import is_on
@@ -132,6 +135,51 @@ def test_runs_with_and_without_a_switch(monkeypatch: pytest.MonkeyPatch) -> None
     assert shipped.values["PSNR dB"] == exact.values["PSNR dB"] > 5
     assert exact.values["saves %"] == pytest.approx(100 * (1 - 1 / exact.values["times as shipped"]))
     assert len(shipped.samples) == TINY.steps
+
+
+EMULATION = """
+import sys
+import torch
+from nsvq_lightning.commands.benchmark import timing, train
+torch.set_num_threads(int(sys.argv[1]))
+timing.SGEMM_SIDE, train.QUICK_DEMO = 64, ("--data.factor=4",)
+scope = timing.Scope(quick=True, steps=40, emulate=(1, 2, 64))
+for row in train.run(scope):
+    print(row.method, row.values["PSNR dB"], row.values["splats"], row.values["seconds"], sep=":")
+"""
+
+
+def emulated(threads: int) -> subprocess.CompletedProcess[str]:
+    # The first kernels of a process, whose threads it takes over.
+    command = [sys.executable, "-c", EMULATION, str(threads)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_more_cores_are_emulated_with_the_same_bits() -> None:
+    ran = emulated(2)
+    assert ran.returncode == 0, ran.stderr
+    rows = [line.split(":") for line in ran.stdout.splitlines() if line.count(":") == 3]
+    assert [row[0] for row in rows] == [
+        "as shipped",
+        "between kernels",
+        *(f"{cores} cores, expected" for cores in (1, 2, 64)),
+    ]
+    assert len({(psnr, splats) for _, psnr, splats, _ in rows}) == 1
+    shipped, between, one, two, many = (float(row[3]) for row in rows)
+    assert 0 < between < many < two < one
+    assert two - between > (one - between) / 2
+    assert shipped > between
+
+
+def test_cores_are_not_emulated_on_one_thread() -> None:
+    assert "allow two (OMP_NUM_THREADS=2)" in emulated(1).stderr
+
+
+def test_cores_take_parts_as_they_are_done() -> None:
+    assert makespan([3.0, 1.0, 1.0, 1.0], 2) == 3
+    assert makespan([1.0, 1.0, 1.0, 3.0], 2) == 4
+    assert makespan([1.0, 2.0], 1) == 3
+    assert makespan([1.0, 2.0], 8) == 2
 
 
 def test_what_is_between_steps_is_not_in_their_time(monkeypatch: pytest.MonkeyPatch) -> None:
