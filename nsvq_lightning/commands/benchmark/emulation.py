@@ -3,7 +3,7 @@
 Numba starts all parallel work through one C function; another one takes its place here. It lets a kernel's parts run
 one by one and times each; cores that take them in turn would be done after the longest queue, plus the time to wake
 them. What lies between the kernels counts as it is. Each core is assumed to be as fast as one alone: what cores share,
-above all memory, shows in the rows of one and two threads, which are measured as well.
+above all memory, shows where one and two of them are compared with what one and two threads really take.
 """
 
 import ctypes

@@ -190,7 +190,7 @@ def run(scope: Scope) -> Iterator[Measurement]:
             _train(scope, parts)
         regions.emulate(0)
         clocks |= {"between kernels": parts.expected(0)}
-        clocks |= {f"{cores} cores, expected": parts.expected(cores) for cores in scope.emulate}
+        clocks |= {f"{cores}-core machine, expected": parts.expected(cores) for cores in scope.emulate}
     scene = "demo" if scope.photos is None else scope.photos.resolve().name
     described = f"{scene}, {Path(_config(scope)).name}, {scope.steps} steps"
     shipped = clocks["as shipped"]

@@ -162,7 +162,7 @@ def test_more_cores_are_emulated_with_the_same_bits() -> None:
     assert [row[0] for row in rows] == [
         "as shipped",
         "between kernels",
-        *(f"{cores} cores, expected" for cores in (1, 2, 64)),
+        *(f"{cores}-core machine, expected" for cores in (1, 2, 64)),
     ]
     assert len({(psnr, splats) for _, psnr, splats, _ in rows}) == 1
     shipped, between, one, two, many = (float(row[3]) for row in rows)
