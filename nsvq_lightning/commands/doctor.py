@@ -355,9 +355,9 @@ CACHE_BYTES = 4 << 30
 
 
 def check_budget(scene: "Scene") -> Iterator[Finding]:
-    """Memory against what is available; time from steps with as many splats as ``fast.yaml`` makes of the scene."""
+    """Memory of the paper's run against what is available; time from steps with the splats of ``fast.yaml``."""
     from nsvq_lightning.callbacks import BudgetedGrowth, PhaseSchedule, SplatBudget
-    from nsvq_lightning.callbacks.forecast import iteration_seconds
+    from nsvq_lightning.callbacks.forecast import PAPER_SPLATS, iteration_seconds
     from nsvq_lightning.callbacks.growth import splats_for_photos
     from nsvq_lightning.compute.devices import best_device
     from nsvq_lightning.data.scene import detailed_pixels
@@ -366,14 +366,15 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
     phases = PhaseSchedule(**fast["callbacks"]["phases"])
     wanted = SplatBudget(**fast["callbacks"]["budget"])
     growth = BudgetedGrowth()
-    budget = splats_for_photos(len(scene.train), detailed_pixels(scene), wanted.quality)
-    most = round(growth.overshoot * budget)
+    default = splats_for_photos(len(scene.train), detailed_pixels(scene))
+    budget = round(wanted.quality * default)
+    paper = round(PAPER_SPLATS * default)
     kept = min(scene.images.nbytes, CACHE_BYTES)  # the others are decoded each time
     needed = 1.2e9 + kept  # Python, torch, Lightning, compiled kernels and evaluations
-    needed += 59 * 4 * 6 * most  # float32 of a splat, each with gradient, two moments, and copies while editing
+    needed += 59 * 4 * 6 * paper  # float32 of a splat, each with gradient, two moments, and copies while editing
     # Buffers of the renderer, the loss and the picture itself.
     needed += 100 * max(camera.width * camera.height for camera in scene.cameras)
-    text = f"about {readable_bytes(needed)} with {most:,} splats and {readable_bytes(kept)} of photos"
+    text = f"about {readable_bytes(needed)} with {paper:,} splats and {readable_bytes(kept)} of photos"
     free = available_memory()
     advice = f"{readable_bytes(free or 0)} are available; lower --data.max_width or --data.cache_bytes"
     yield judged("run memory", text, advice, when=free is not None and needed > free)

@@ -54,8 +54,7 @@ def clear(array, first, last):
 @parallel
 def clear_all(part, parts, table):
     """Zero a table."""
-    first, last = share(table.shape[0], part, parts)
-    clear(table, first, last)
+    clear(table, *share(table.shape[0], part, parts))
 
 
 @inline

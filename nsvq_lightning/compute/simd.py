@@ -243,8 +243,7 @@ def scratch(typingctx, count):
         pointer = _f32.as_pointer()
         data = builder.asm(ir.FunctionType(pointer, [pointer]), "", "=r,0", [builder.bitcast(memory, pointer)], False)
         array = context.make_array(kind)(context, builder)
-        stride = _i64(4)
-        context.populate_array(array, data=data, shape=[_i64(size)], strides=[stride], itemsize=stride, meminfo=None)
+        context.populate_array(array, data=data, shape=[_i64(size)], strides=[_i64(4)], itemsize=_i64(4), meminfo=None)
         return array._getvalue()
 
     return kind(count), emit

@@ -35,7 +35,7 @@ def find_palette(rows: Float32s, weight: NDArray[np.number[Any]], count: int) ->
     wide = weight.astype(np.float64)
     check_array("weight", wide, rows.shape[:1], wide.dtype)
     order = np.arange(len(rows))
-
+    # Of each cell: how much less the sum of squares is if it is cut, negative; start, cut, end.
     heap: list[tuple[float, int, int, int]] = []
 
     def add(start: int, end: int) -> None:
@@ -149,9 +149,9 @@ def in_order_of_use(rows: Float32s, labels: Integers) -> tuple[Float32s, Int64s]
 def scalar_kmeans(values: Float32s, weight: Integers | int = 1, count: int = 256) -> Float32s:
     """Levels ``[count]``, ascending, that nearly minimize the mean squared distance of values to their nearest level.
 
-    If there are no more distinct values than levels, the levels are those values. Otherwise one cell of all values is
-    split where that gains most, then always the cell that gains most, until there are enough; the steps of Lloyd (1982)
-    then move each level to the mean of its values until none moves. On random numbers this ends within a tenth of the
+    If there are no more distinct values than levels, the levels are those values. Otherwise they start as the means of
+    the cells of :func:`find_palette`; the steps of Lloyd (1982) then move each to the mean of its values until none
+    moves. On random numbers this ends within a tenth of the
     optimum.
 
     Args:

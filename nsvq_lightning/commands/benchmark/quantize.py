@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -18,19 +19,21 @@ from nsvq_lightning.splats.splats import RawSplats, Splats
 
 def run(scope: Scope) -> Iterator[Measurement]:
     """Time the search for each attribute."""
-    for workload in workloads(scope):
-        shuffled = torch.randperm(len(workload.splats.means), generator=generator(0, 0, "visible"))
-        chosen = shuffled[: int(0.8 * len(shuffled))].sort().values  # about as many as a camera sees
-        for name, quantizer in prepare(workload.splats, scope.codebooks).items():
-            rows = attribute_rows(workload.splats, name)[chosen]
-            codebook = quantizer.codebook.detach()
-            cases = {
-                "nsvq_lightning": partial(nearest, rows, codebook),
-                "cdist + argmin": partial(_by_distances, rows, codebook),
-            }
-            errors = {method: code_errors(rows, codebook, call()) for method, call in cases.items()}
-            described = f"{workload.name} {name}: {len(rows)} rows, D {rows.shape[1]}, K {len(codebook)}"
-            yield from compare("search", described, cases, errors, scope)
+    if scope.scene is None:
+        scope = replace(scope, workloads=("A20k" if scope.quick else "B100k",))
+    (workload,) = workloads(scope)
+    shuffled = torch.randperm(len(workload.splats.means), generator=generator(0, 0, "visible"))
+    chosen = shuffled[: int(0.8 * len(shuffled))].sort().values  # about as many as a camera sees
+    for name, quantizer in prepare(workload.splats, scope.codebooks).items():
+        rows = attribute_rows(workload.splats, name)[chosen]
+        codebook = quantizer.codebook.detach()
+        cases = {
+            "nsvq_lightning": partial(nearest, rows, codebook),
+            "cdist + argmin": partial(_by_distances, rows, codebook),
+        }
+        errors = {method: code_errors(rows, codebook, call()) for method, call in cases.items()}
+        described = f"{name}: {len(rows)} rows, D {rows.shape[1]}, K {len(codebook)}"
+        yield from compare("search", described, cases, errors, scope)
 
 
 def prepare(splats: RawSplats, codebooks: str) -> dict[str, Quantizer]:

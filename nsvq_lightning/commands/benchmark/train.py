@@ -101,8 +101,7 @@ class RegionClock(StepClock):
         for (phase, took), kernels in zip(self.steps, self.kernels, strict=True):
             seconds = took / 1000 - sum(whole for _, whole in kernels)
             if cores:
-                waking = self.regions.wake * (cores > 1)
-                seconds += sum(makespan(parts, cores) + waking for parts, _ in kernels)
+                seconds += sum(makespan(parts, cores) + self.regions.wake * (cores > 1) for parts, _ in kernels)
             clock.steps.append((phase, 1000 * seconds))
         clock.products, clock.psnr = self.products, self.psnr
         return clock
@@ -189,7 +188,7 @@ def run(scope: Scope) -> Iterator[Measurement]:
         for _ in range(rounds):
             _train(scope, parts)
         regions.emulate(0)
-        clocks |= {"between kernels": parts.expected(0)}
+        clocks["between kernels"] = parts.expected(0)
         clocks |= {f"{cores}-core machine, expected": parts.expected(cores) for cores in scope.emulate}
     scene = "demo" if scope.photos is None else scope.photos.resolve().name
     described = f"{scene}, {Path(_config(scope)).name}, {scope.steps} steps"
