@@ -177,13 +177,13 @@ def in_parallel(typingctx: Any, helper: Any, parts: Any, arguments: Any) -> Any:
         share.linkage = "internal"
         _emit_share(context, ir.IRBuilder(share.append_basic_block()), compiled, state.type, arguments)
         threads = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_i64, []), "get_num_threads")
+        # All threads, also for fewer parts: Numba would keep a smaller number for the kernels that follow, and OpenMP
+        # end the other threads. They find a base address that does not move from share to share.
         count = builder.call(threads, [])
-        count = builder.select(builder.icmp_signed("<", values[1], count), values[1], count)
-        # Numba's threads find a base address that does not move from share to share.
         base, moves, counts = (cgutils.alloca_once_value(builder, value) for value in (_byte_p(None), _i64(0), count))
         pointers = [builder.bitcast(pointer, _byte_p) for pointer in (share, base, counts, moves, state)]
         run = cgutils.get_or_insert_function(builder.module, _PARALLEL_FOR, "numba_parallel_for")
-        with builder.if_else(builder.icmp_signed(">", count, _i64(1))) as (several, one):
+        with builder.if_else(builder.icmp_signed(">", values[1], _i64(1))) as (several, one):
             with several:
                 builder.call(run, [*pointers, _i64(0), _i64(1), count])
             with one:
@@ -202,6 +202,7 @@ def _emit_share(context: Any, builder: Any, compiled: Any, state_type: Any, argu
     fields = [cgutils.gep_inbounds(builder, state, 0, place) for place in range(ARGUMENTS + 1)]
     parts, end, packed = (builder.load(fields[place]) for place in (PARTS, END, ARGUMENTS))
     values = cgutils.unpack_tuple(builder, packed, len(arguments))
+    sums = [cgutils.alloca_once_value(builder, _i64(0)) for _ in (SUM, FAILURES)]
     take, call, leave = map(builder.append_basic_block, ("take", "call", "leave"))
     builder.branch(take)
     builder.position_at_end(take)
@@ -211,10 +212,12 @@ def _emit_share(context: Any, builder: Any, compiled: Any, state_type: Any, argu
     given = [part, parts, *values]
     status, result = context.call_internal_no_propagate(builder, compiled.fndesc, compiled.signature, given)
     found = result if compiled.signature.return_type == types.int64 else _i64(0)
-    for place, value in ((SUM, found), (FAILURES, builder.zext(status.is_error, _i64))):
-        builder.atomic_rmw("add", fields[place], value, "monotonic")
+    for own, value in zip(sums, (found, builder.zext(status.is_error, _i64)), strict=True):
+        builder.store(builder.add(builder.load(own), value), own)
     builder.branch(take)
     builder.position_at_end(leave)
+    for place, own in zip((SUM, FAILURES), sums, strict=True):
+        builder.atomic_rmw("add", fields[place], builder.load(own), "monotonic")
     builder.ret_void()
 
 

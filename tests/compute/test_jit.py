@@ -1,5 +1,6 @@
 """The number of threads that the user has set holds for all kernels, from the first one on."""
 
+import os
 import subprocess
 import sys
 
@@ -26,6 +27,28 @@ def test_numba_leaves_the_number_of_threads_as_it_was(threads: int) -> None:
     in_torch, in_kernels = map(int, ran.stdout.split())
     assert in_torch == threads
     assert 1 <= in_kernels <= threads
+
+
+FEW_PARTS = """
+import os
+import numba, numpy as np, torch
+torch.set_num_threads(4)
+from nsvq_lightning.compute.jit import thread_count
+from nsvq_lightning.compute.rows import clear_all
+threads = thread_count()
+clear_all(64, np.zeros(64, np.float32))
+running = set(os.listdir("/proc/self/task")) if os.path.isdir("/proc/self/task") else set()
+clear_all(2, np.zeros(64, np.float32))
+left = set(os.listdir("/proc/self/task")) if running else set()
+print(threads, numba.get_num_threads(), len(running - left))
+"""
+
+
+def test_a_kernel_of_few_parts_leaves_the_others_their_threads() -> None:
+    """Numba keeps the number that a kernel has run on for the next one, and OpenMP ends the threads beyond it."""
+    four = {**os.environ, "NUMBA_NUM_THREADS": "4", "OMP_NUM_THREADS": "4"}
+    ran = subprocess.run([sys.executable, "-c", FEW_PARTS], env=four, capture_output=True, text=True, check=True)
+    assert ran.stdout.split() == ["4", "4", "0"]
 
 
 @parallel
