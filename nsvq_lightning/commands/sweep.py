@@ -1,4 +1,4 @@
-"""Train every combination of the lists; write a table and a picture of PSNR over file size.
+"""Train every combination of the lists; write tables of what each came to, and of how far it is from the first.
 
 The same command goes on where it was, and trains only what is new. Options of 'nsvq fit' may follow; they hold for
 every run: --data.factor=2 --splats=80000
@@ -13,6 +13,7 @@ import hashlib
 import io
 import json
 import logging
+import re
 import shlex
 import shutil
 import signal
@@ -38,6 +39,8 @@ log = logging.getLogger(__name__)
 # What a line of ``results.csv`` says, by column.
 Row = dict[str, Any]
 
+# A difference is called noise if, where there is none, as much is met with this chance or more.
+CHANCE = 0.05
 # In the folder of a run.
 CHECKPOINT = Path("checkpoints", "last.ckpt")
 
@@ -275,10 +278,9 @@ def train(run: Run) -> str:
     if status < 0:
         guess = ", perhaps for want of memory" if status == -signal.SIGKILL else ""
         return f"killed by signal {-status}{guess} (see {said})"
-    reason = f"exit status {status}"
-    lines = list(filter(None, map(str.strip, said.read_text(encoding="utf-8", errors="replace").splitlines())))
-    errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
-    return f"{[reason, *lines, *errors][-1]} (see {said})"
+    text = said.read_text(encoding="utf-8", errors="replace").strip()
+    errors = re.findall(r"^error: (.+)$", text, re.MULTILINE)
+    return f"{[f'exit status {status}', *text.splitlines(), *errors][-1]} (see {said})"
 
 
 def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> list[Row]:
@@ -342,12 +344,12 @@ TABLE = {"psnr": ".2f", "ssim": ".4f", "bytes": ",.0f", "splats": ",.0f", "psnr_
 
 
 def write_results(output: Path, rows: Sequence[Row]) -> None:
-    """Write ``results.csv``, a row a run, and of those that have not failed ``results.md`` and ``results.png``.
+    """Write ``results.csv``, a row a run, and ``results.md``, of those that have not failed.
 
-    Those that differ in the seed alone are a line of the table, with mean and standard deviation, and a point of the
-    picture with whiskers. That has a panel for each scene, and a curve for each configuration and quantizer.
+    Those that differ in the seed alone are a line of the table, with mean and standard deviation, and how far they are
+    from the scene's first line (:func:`difference`).
     """
-    from nsvq_lightning.report import numbers, pictures
+    from nsvq_lightning.report import numbers
 
     groups: dict[tuple[str, ...], list[Row]] = {}
     failed = []
@@ -357,58 +359,42 @@ def write_results(output: Path, rows: Sequence[Row]) -> None:
         else:
             groups.setdefault(tuple(row[name] for name in NAMES), []).append(row)
     lines = []
+    first: dict[str, list[Row]] = {}
     for key, group in groups.items():
+        reference = first.setdefault(key[0], group)
         line = [*(name or "–" for name in key), str(len(group))]
         for column, form in TABLE.items():
-            mean, spread = moments(group, column)
-            text = "–" if np.isnan(mean) else f"{mean:{form}}"
-            if len(group) > 1 and not np.isnan(mean):
-                text += f" ± {spread:{form}}"
+            values = [row[column] for row in group if row[column] is not None]
+            text = f"{np.mean(values):{form}}" if values else "–"
+            if len(values) > 1:
+                text += f" ± {np.std(values, ddof=1):{form}}"
             line.append(text)
-        lines.append(line)
-    text = f"# nsvq sweep\n\n{markdown_table([*NAMES, 'runs', *TABLE], lines, words=NAMES)}\n\n"
+        lines.append([*line, difference(group, reference)])
+    heads = [*NAMES, "runs", *TABLE, "to the first"]
+    text = f"# nsvq sweep\n\n{markdown_table(heads, lines, words=NAMES)}\n\n"
     text += "Mean ± standard deviation over the seeds. PSNR (dB) and SSIM are of the decoded file on the test views, "
-    text += "psnr_before of the plain splats.\n"
+    text += "psnr_before of the plain splats. To the first line of the scene: mean difference of the PSNR ± standard "
+    text += f"error, paired by seed; noise where chance alone does as much in {CHANCE:.0%} of the cases.\n"
     if failed:
         text += "\nFailed:\n\n" + "".join(failed)
     numbers.write_csv(output / "results.csv", rows)
     write_text(output / "results.md", text)
-    if groups:
-        pictures.write_figure(output / "results.png", figure(list(groups.values())))
 
 
-def moments(rows: Sequence[Row], column: str) -> tuple[float, float]:
-    """Mean and standard deviation (n - 1; 0 for a single run) of a column; NaN where none knows it."""
-    values = [row[column] for row in rows if row[column] is not None]
-    spread = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
-    return float(np.mean(values)) if values else np.nan, spread
+def difference(rows: Sequence[Row], first: Sequence[Row]) -> str:
+    """Mean difference of the PSNR of runs to others with the same seeds ± its standard error, and whether it is noise.
 
-
-def figure(groups: Sequence[Sequence[Row]]) -> Any:
-    """PSNR over file size, as a Matplotlib figure; each group is a point.
-
-    Args:
-        groups: Runs that differ in the seed alone.
+    Pairs share what a seed decides, so their differences vary less than the runs do; Student's t says how far the mean
+    of so few can be from 0 by chance.
     """
-    from nsvq_lightning.report.pictures import new_figure
+    from scipy import stats
 
-    scenes: dict[str, dict[str, list[Sequence[Row]]]] = {}
-    for group in groups:
-        first = group[0]
-        name = ", ".join(filter(None, (first["config"], first["quantizer"])))
-        scenes.setdefault(first["scene"], {}).setdefault(name, []).append(group)
-    drawn = new_figure(7.0, 4.6 * len(scenes))  # inches
-    for number, (scene, curves) in enumerate(scenes.items(), start=1):
-        axis = drawn.add_subplot(len(scenes), 1, number)
-        for name, points in curves.items():
-            points.sort(key=lambda point: moments(point, "bytes"))
-            x, x_spread = np.transpose([moments(point, "bytes") for point in points]) / 1e6
-            y, y_spread = np.transpose([moments(point, "psnr") for point in points])
-            axis.errorbar(x, y, y_spread, x_spread, fmt="o-", linewidth=1, capsize=2, label=name)
-            for point, *place in zip(points, x, y, strict=True):
-                axis.annotate(point[0]["codebooks"], place, (4, 5), textcoords="offset points", fontsize=7)
-        # Files without codebooks are many times as large.
-        axis.set(title=scene, xscale="log", xlabel="size of the file, MB", ylabel="test PSNR of the decoded file, dB")
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=8)
-    return drawn
+    known = {row["seed"]: row["psnr"] for row in first}
+    found = [row["psnr"] - known[row["seed"]] for row in rows if None not in (row["psnr"], known.get(row["seed"]))]
+    if rows is first or not found:
+        return "–"
+    if len(found) == 1:
+        return f"{found[0]:+.2f}, one seed"
+    mean, error = np.mean(found), stats.sem(found)
+    noise = abs(mean) <= error * stats.t.isf(CHANCE / 2, len(found) - 1)
+    return f"{mean:+.3f} ± {error:.3f}{', noise' * bool(noise)}"
