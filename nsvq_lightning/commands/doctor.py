@@ -139,7 +139,7 @@ def check_packages() -> Iterator[Finding]:
 
 
 def check_threads() -> Iterator[Finding]:
-    """Whether the kernels use all cores, and do not wait for each other by spinning."""
+    """Whether the kernels use all cores."""
     import numba
     import torch
 
@@ -155,9 +155,6 @@ def check_threads() -> Iterator[Finding]:
     text = f"{used} used of {cores} cores (torch {torch.get_num_threads()}, numba {numba.config.NUMBA_NUM_THREADS})"
     advice = f"as many as cores are fastest; unset OMP_NUM_THREADS and NUMBA_NUM_THREADS, or set them to {cores}"
     yield judged("threads", text, advice, when=used != cores and not spared)
-    policy = os.environ.get("OMP_WAIT_POLICY", "not set")
-    advice = "on a shared machine threads that wait by spinning slow a step down several times; set it to passive"
-    yield judged("waiting", f"OMP_WAIT_POLICY is {policy}", advice, when=policy.lower() != "passive")
 
 
 # Bytes; less may not hold checkpoints and report.
@@ -283,8 +280,9 @@ def check_overlap(model: "ColmapModel") -> Iterator[Finding]:
 
 
 def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
-    """Load the folder as a run does it, then check its split, its photos, and what a run will take."""
-    from nsvq_lightning.data.scene import ONE_PLACE, load_scene
+    """Load the folder as a run does it, then check its split, its photos and their shape, and what a run will take."""
+    from nsvq_lightning.data.images import same_shape
+    from nsvq_lightning.data.scene import ONE_PLACE, OTHER_SHAPE, load_scene
 
     scene = load_scene(root)
     train, test = len(scene.train), len(scene.test)
@@ -293,29 +291,13 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
     yield judged("split", text, advice, when=train < 20)
     if not scene.extent > 0:
         yield Finding("problem", "extent", f"all train photos {ONE_PLACE}")
-    yield from attempt("sizes", check_sizes(scene, model))
+    cameras = [model.cameras[image.camera_id] for image in model.images]
+    pairs = zip(cameras, scene.images.sources, strict=True)
+    others = sum(not same_shape(source.size, (camera.width, camera.height)) for camera, source in pairs)
+    if others:
+        yield Finding("problem", "sizes", f"{others} of {len(scene)} files {OTHER_SHAPE}")
     yield from attempt("photos", check_photos(scene, model))
     yield from attempt("run time", check_budget(scene))
-
-
-def check_sizes(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
-    """Whether files are of the size that the model says, and what becomes of those that lie on their side."""
-    from nsvq_lightning.data.colmap import size_range
-    from nsvq_lightning.data.images import same_shape
-    from nsvq_lightning.data.scene import OTHER_SHAPE
-
-    sources = scene.images.sources
-    scaled = others = 0
-    for image, source in zip(model.images, sources, strict=True):
-        camera = model.cameras[image.camera_id]
-        size = camera.width, camera.height
-        others += not same_shape(source.size, size)
-        scaled += source.size != size
-    text = f"trained at {size_range(scene.cameras)}; {others or scaled} of {len(sources)} files "
-    if others:
-        yield Finding("problem", "sizes", f"{text}{OTHER_SHAPE}")
-    else:
-        yield Finding("good", "sizes", f"{text}are scaled from what {model.source} says, their cameras with them")
 
 
 def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
@@ -350,14 +332,10 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
         yield Finding("note", "registered", f"{text}: {advice}")
 
 
-# Default of ``--data.cache_bytes``.
-CACHE_BYTES = 4 << 30
-
-
 def check_budget(scene: "Scene") -> Iterator[Finding]:
-    """Memory of the paper's run against what is available; time from steps with the splats of ``fast.yaml``."""
+    """Time of a run, from steps with the splats of ``fast.yaml``."""
     from nsvq_lightning.callbacks import BudgetedGrowth, PhaseSchedule, SplatBudget
-    from nsvq_lightning.callbacks.forecast import PAPER_SPLATS, iteration_seconds
+    from nsvq_lightning.callbacks.forecast import iteration_seconds
     from nsvq_lightning.callbacks.growth import splats_for_photos
     from nsvq_lightning.compute.devices import best_device
     from nsvq_lightning.data.scene import detailed_pixels
@@ -366,18 +344,7 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
     phases = PhaseSchedule(**fast["callbacks"]["phases"])
     wanted = SplatBudget(**fast["callbacks"]["budget"])
     growth = BudgetedGrowth()
-    default = splats_for_photos(len(scene.train), detailed_pixels(scene))
-    budget = round(wanted.quality * default)
-    paper = round(PAPER_SPLATS * default)
-    kept = min(scene.images.nbytes, CACHE_BYTES)  # the others are decoded each time
-    needed = 1.2e9 + kept  # Python, torch, Lightning, compiled kernels and evaluations
-    needed += 59 * 4 * 6 * paper  # float32 of a splat, each with gradient, two moments, and copies while editing
-    # Buffers of the renderer, the loss and the picture itself.
-    needed += 100 * max(camera.width * camera.height for camera in scene.cameras)
-    text = f"about {readable_bytes(needed)} with {paper:,} splats and {readable_bytes(kept)} of photos"
-    free = available_memory()
-    advice = f"{readable_bytes(free or 0)} are available; lower --data.max_width or --data.cache_bytes"
-    yield judged("run memory", text, advice, when=free is not None and needed > free)
+    budget = splats_for_photos(len(scene.train), detailed_pixels(scene), wanted.quality)
     steps = phases.limited(fast["trainer"]["max_steps"], len(scene.train))
     parts = growth.stretches(phases.schedule(steps), round(wanted.start * budget), budget)
     minutes = steps * iteration_seconds(scene, parts, best_device()) / 60

@@ -18,7 +18,7 @@ from typing import Any, TextIO
 
 from nsvq_lightning.commands import COMMANDS, OF_LIGHTNING, nearest, overview, say
 from nsvq_lightning.commands.arguments import Parser
-from nsvq_lightning.commands.settings import FIT_HELP, check_early, configs_among, expand, limit_aliases
+from nsvq_lightning.commands.settings import FIT_HELP, check_early, configs_among, expand
 from nsvq_lightning.version import __version__
 
 # Environment variable that makes errors show their traceback.
@@ -96,16 +96,15 @@ def lightning(argv: Sequence[str] | None = None) -> int:
     if not arguments or arguments[0].startswith("-") or arguments[0] in COMMANDS:
         return main(arguments)
     points = entry_points(group="console_scripts", name="lightning")
-    scripts = {re.sub(r"[-_.]+", "-", point.dist.name).lower(): point for point in points if point.dist is not None}
-    scripts.pop("nsvq-lightning", None)
-    if not scripts:
+    others = sorted(point for point in points if not point.value.startswith("nsvq_lightning."))
+    if not others:
         return _failed(
             f"lightning: unknown command {arguments[0]!r}; nsvq-lightning has {', '.join(COMMANDS)}, "
             "and no other installed package has a lightning command",
             2,
         )
     sys.argv = ["lightning", *arguments]
-    sys.exit(scripts[min(scripts)].load()())
+    sys.exit(others[0].load()())
 
 
 def run_command(name: str, arguments: Sequence[str]) -> int:
@@ -182,7 +181,6 @@ def _run_lightning(arguments: list[str], own_process: bool) -> int:
     _quiet_lightning()
     if os.getcwd() not in sys.path:  # last, unlike `python -m`: for the user's own quantizers and callbacks
         sys.path.append(os.getcwd())
-    limit_aliases()
     configs = configs_among(arguments)
     try:
         run_cli(arguments)

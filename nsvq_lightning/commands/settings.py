@@ -1,21 +1,15 @@
 """Settings of ``nsvq fit`` as they are typed: configs by name, short options, and what is refused without Lightning."""
 
 import argparse
-import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache
 from importlib.metadata import version
-from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from nsvq_lightning.commands import nearest
 from nsvq_lightning.data import NO_FOLDER
 from nsvq_lightning.top_level import folder_of
-
-if TYPE_CHECKING:
-    from yaml.nodes import Node
 
 # What ``nsvq fit --help`` prints without Lightning, whose import takes seconds; a test compares it with its parser.
 FIT_HELP = Path(__file__).with_name("fit_help.txt")
@@ -188,9 +182,8 @@ def values_by_name(options: Iterable[str]) -> dict[str, str]:
     return values
 
 
-# Of a config, and of its values with every alias written out; that of a run has 6 kB and 500 values.
+# Of a config; that of a run has 6 kB.
 MAX_BYTES = 1 << 17
-MAX_VALUES = 100_000
 
 
 def check_config(path: str) -> dict[str, Any]:
@@ -210,43 +203,10 @@ def check_config(path: str) -> dict[str, Any]:
     try:
         # Not the parser's loader: what is nested too deep would overflow its stack.
         loader = yaml.SafeLoader(file.read_text(encoding="utf-8"))
-        node = _limited(loader.get_single_node())
-        settings = None if node is None else loader.construct_document(node)
+        settings = loader.get_single_data()
     except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error
     if not isinstance(settings, dict):
         found = "nothing" if settings is None else type(settings).__name__
         raise ValueError(f"config {path} holds {found}: give settings by name, like 'trainer: {{max_steps: 1000}}'")
     return settings
-
-
-@cache  # otherwise, each call would wrap the loader once more
-def limit_aliases() -> None:
-    """Let the parser refuse what aliases make too large, in files that a config names and in its texts, too."""
-    from jsonargparse._loaders_dumpers import get_yaml_default_loader  # all of its ways to read YAML use this class
-
-    loader = get_yaml_default_loader()  # type: ignore[no-untyped-call]
-    compose = loader.get_single_node
-    loader.get_single_node = lambda self: _limited(compose(self))
-
-
-def _limited(node: "Node | None") -> "Node | None":
-    """A document of YAML, unless it has more values than a config."""
-    import yaml
-
-    if node is not None and _values(node, {}) > MAX_VALUES:
-        raise yaml.YAMLError(f"more than {MAX_VALUES} values by aliases (*name)")
-    return node
-
-
-def _values(node: "Node", known: dict[int, float]) -> float:
-    """Number of values in a node of YAML with all its aliases written out; infinite for one that holds itself."""
-    if id(node) not in known:
-        known[id(node)] = math.inf
-        parts: Iterable[Node] = ()
-        if node.id == "sequence":
-            parts = node.value
-        elif node.id == "mapping":
-            parts = chain.from_iterable(node.value)
-        known[id(node)] = 1 + sum(_values(part, known) for part in parts)
-    return known[id(node)]

@@ -43,7 +43,7 @@ def test_every_finding_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     findings = {found[2]: found for found in map(re.compile(r"(good|note) +(\S+) +(.*)").fullmatch, lines) if found}
     assert (len(findings), empty) == (len(lines), "")
     assert last.startswith("no problems, ")
-    assert findings.keys() == {"machine", "versions", "opencv", "threads", "waiting", "memory", "disk", "self-test"}
+    assert findings.keys() == {"machine", "versions", "opencv", "threads", "memory", "disk", "self-test"}
     text = findings["self-test"][3]
     assert text.startswith("cpu: relative errors against float64: image ")
     errors = [float(part.split()[-1]) for part in text.partition("image")[2].split(",")]
@@ -62,7 +62,7 @@ def test_without_opencv_the_other_checks_are_still_made() -> None:
     code = "import sys; sys.modules['cv2'] = None\nfrom nsvq_lightning.commands.main import main\n"
     code += "sys.exit(main(['doctor']))"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (run.returncode, "problem  opencv" in run.stdout, "waiting" in run.stdout) == (1, True, True)
+    assert (run.returncode, "problem  opencv" in run.stdout, "threads" in run.stdout) == (1, True, True)
 
 
 @pytest.mark.parametrize(
@@ -82,14 +82,11 @@ def test_a_check_that_breaks_is_a_problem_and_keeps_what_it_said_before(error: E
     assert (second.verdict, second.text) == ("problem", said)
 
 
-def test_threads_and_waiting_are_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_are_judged(monkeypatch: pytest.MonkeyPatch) -> None:
     for used, verdict in ((2, "note"), (4, "good"), (8, "note")):
         monkeypatch.setattr(environment, "usable_cores", lambda: 4)
         monkeypatch.setattr(jit, "thread_count", lambda used=used: used)
         assert next(doctor.check_threads()).verdict == verdict
-    for policy, verdict in (("passive", "good"), ("ACTIVE", "note")):
-        monkeypatch.setenv("OMP_WAIT_POLICY", policy)
-        assert list(doctor.check_threads())[1].verdict == verdict
     monkeypatch.setattr(jit, "thread_count", lambda: 2)
     monkeypatch.setattr(platform, "system", lambda: "Darwin")
     monkeypatch.setattr(platform, "machine", lambda: "arm64")
@@ -144,17 +141,14 @@ def test_a_sound_scene_has_no_problem(scene: Path) -> None:
 def test_the_estimate_of_a_run_is_measured(demo_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = load_scene(demo_scene)
     assert len(forecast.grown(scene, 2000)) == 2000
-    memory, time = doctor.check_budget(scene)
-    assert re.match(r"about 1\.\d GB with", memory.text)
+    (time,) = doctor.check_budget(scene)
     assert re.match(r"about \d+ min for fast.yaml", time.text)
     # With a millisecond for each splat, instead of what a busy machine takes:
     monkeypatch.setattr(forecast, "step_seconds", lambda scene, count, device: count / 1000)
-    _, time = doctor.check_budget(scene)
+    (time,) = doctor.check_budget(scene)
     found = re.search(r"about (\d+) min", time.text)
     assert found is not None
     assert int(found[1]) > 60
-    monkeypatch.setattr(doctor, "available_memory", lambda: 10**9)
-    assert "max_width" in next(doctor.check_budget(scene)).text
 
 
 def _cut(path: Path) -> None:
@@ -188,7 +182,7 @@ def test_files_outside_the_model_and_of_another_shape_are_named(scene: Path) -> 
     assert cv2.imwrite(str(scene / "images/view_001.png"), picture[:, :50])
     findings = _by_subject(scene)
     assert findings["registered"].text.startswith("1 of 10 files")
-    assert (findings["sizes"].verdict, "; 1 of 9 files" in findings["sizes"].text) == ("problem", True)
+    assert (findings["sizes"].verdict, "1 of 9 files" in findings["sizes"].text) == ("problem", True)
 
 
 def test_masks_that_exclude_most_are_noted(scene: Path) -> None:

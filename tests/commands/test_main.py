@@ -272,8 +272,7 @@ def test_our_words_run_our_command(calls: list[list[str]], install: Install, arg
 def test_foreign_words_go_to_the_other_distribution(
     calls: list[list[str]], install: Install, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    install("NSVQ_Lightning", "foreign:wrong")
-    install("litserve", "foreign:wrong")
+    install("NSVQ_Lightning", "nsvq_lightning.commands.main:lightning")
     install("lightning-sdk", "foreign:run")
     with pytest.raises(SystemExit, match="5"):
         main_module.lightning(["login", "--token", "x"])
@@ -284,7 +283,7 @@ def test_foreign_words_go_to_the_other_distribution(
 def test_without_another_distribution_the_known_words_are_listed(
     install: Install, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    install("nsvq-lightning", "foreign:wrong")
+    install("nsvq-lightning", "nsvq_lightning.commands.main:lightning")
     assert main_module.lightning(["login"]) == 2
     message = capsys.readouterr().err
     assert "unknown command 'login'" in message

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-import re
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
@@ -10,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from nsvq_lightning.commands import settings
-from nsvq_lightning.commands.main import main
 from nsvq_lightning.commands.settings import (
     SHORTHANDS,
     check_config,
@@ -89,12 +86,6 @@ def test_values_are_found_by_the_name_that_an_option_has_without_its_class() -> 
     assert values_by_name(options) == {"data.root": "a=b", "trainer.callbacks": "X", "print_config": ""}
 
 
-def _nines(first: str, next_: str) -> bytes:
-    """A short config of ten lines, each of which holds the one before nine times."""
-    lines = [f"k{i}: &k{i} {next_ % ', '.join([f'*k{i - 1}'] * 9)}" for i in range(1, 10)]
-    return "\n".join([f"k0: &k0 {first}", *lines]).encode()
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -105,9 +96,6 @@ def _nines(first: str, next_: str) -> bytes:
         (b"\xff\xfe\0", "is not YAML .*can't decode"),
         (b"#" * 200_000, "has 200000 bytes"),
         (b"[" * 100_000, "is not YAML .*recursion"),
-        (b"a: &a {b: *a}", "is not YAML .*more than 100000 values by aliases"),
-        (_nines("[1]", "[%s]"), "is not YAML .*more than 100000 values"),
-        (_nines("{c: 1}", "{<<: [%s]}"), "is not YAML .*more than 100000 values"),
     ],
 )
 def test_what_cannot_be_a_config(tmp_path: Path, content: bytes, message: str) -> None:
@@ -116,16 +104,6 @@ def test_what_cannot_be_a_config(tmp_path: Path, content: bytes, message: str) -
     with pytest.raises(ValueError, match=rf"mine\.yaml {message}"):
         check_config(str(path))
     check_config(str(tmp_path / "none.yaml"))  # the parser's to complain about
-
-
-def test_a_config_that_a_config_names_may_not_explode_either(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    (tmp_path / "inner.yaml").write_bytes(_nines("[1]", "[%s]"))
-    (tmp_path / "outer.yaml").write_text(json.dumps({"data": str(tmp_path / "inner.yaml")}))
-    with pytest.raises(SystemExit):
-        main(["fit", "--config", str(tmp_path / "outer.yaml")])
-    assert re.search(r"inner\.yaml: more than 100000 values by aliases", capsys.readouterr().err)
 
 
 def test_a_config_may_use_aliases(tmp_path: Path) -> None:
