@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import torch
 from lightning.pytorch import Trainer
@@ -74,25 +74,16 @@ class CodebookInit(SplatCallback):
     """At the first iteration of the quantize phase, fit every codebook to the rows of all splats (k-means).
 
     NaN and infinite splats are dropped first, whenever they were last searched for.
-
-    Raises:
-        ValueError: Unknown weights.
     """
 
-    weights: Literal["none", "contribution"] = "contribution"
-    """Weight of a splat in k-means: ``none`` weights all equally, as in the paper; ``contribution`` weights each by its
-    blending weight in the train views, so that codes go to visible splats. Scales stay unweighted: small splats
-    contribute little, but a small splat with the code of larger ones is visible. Right after k-means with 4k codes on
-    187 k splats, weighting changed test PSNR by -0.37 dB for scales, +0.07 for rotations, +0.04 for colours and +0.15
-    for SH."""
+    weighted: bool = True
+    """Weight splats in k-means by their blending weight in the train views, so that codes go to visible ones; the paper
+    weights all equally. Scales stay unweighted: small splats contribute little, but a small splat with the code of
+    larger ones is visible. Right after k-means with 4k codes on 187 k splats, weighting changed test PSNR by -0.37 dB
+    for scales, +0.07 for rotations, +0.04 for colours and +0.15 for SH."""
     values_per_splat: Positive | None = None
     """Largest K·D of a codebook for each splat; None has no limit. A value takes 4 to 5 bits in the file, so 1024 codes
     of 45 values for 36 000 splats take as much as they save."""
-
-    def __post_init__(self) -> None:
-        if self.weights not in ("none", "contribution"):
-            raise ValueError(f"weights must be 'none' or 'contribution', got {self.weights!r}")
-        super().__post_init__()
 
     def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether codebooks are placed before this iteration."""
@@ -103,8 +94,7 @@ class CodebookInit(SplatCallback):
         if not self.is_due(module, iteration):
             return
         keep_finite_splats(trainer, module)
-        weighted = self.weights == "contribution"
-        weights = row_weights(run_scene.train_contributions(trainer, module.scene)) if weighted else None
+        weights = row_weights(run_scene.train_contributions(trainer, module.scene)) if self.weighted else None
         for name, quantizer in module.quantizers.items():
             if trainer.is_global_zero:
                 if self.values_per_splat is not None and hasattr(quantizer, "limit"):

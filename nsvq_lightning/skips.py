@@ -3,7 +3,7 @@
 All switches are on and do not change a bit of the result. They exist so that each can be measured and tested:
 
 * in Python: ``with switched(blocks=False): ...``
-* on the command line: ``nsvq fit --skips.blocks=false``, in a config ``skips: {blocks: false}``
+* on the command line: ``nsvq benchmark train --switches all``
 
 Switches hold for the whole process, so set them before work starts, not while another thread renders.
 """
@@ -14,7 +14,6 @@ from contextlib import contextmanager
 # All switches by name: the work that is skipped while one is on, and when that work is not needed.
 SKIPS = {
     "blocks": "skip 4x4 blocks of pixels: a splat cannot reach them",
-    "saturated": "skip blocks of pixels: all their pixels are opaque",
     "distance_bounds": "skip the nearest code of a splat: bounds prove that it is the last one",
 }
 
@@ -26,18 +25,6 @@ def is_on(name: str) -> bool:
     return _ON[name]
 
 
-def switch(**switches: bool) -> None:
-    """Set switches by name.
-
-    Raises:
-        ValueError: There is no such switch.
-    """
-    unknown = sorted(set(switches) - set(SKIPS))
-    if unknown:
-        raise ValueError(f"unknown switches {', '.join(unknown)}; there are {', '.join(SKIPS)}")
-    _ON.update(switches)
-
-
 @contextmanager
 def switched(**switches: bool) -> Iterator[None]:
     """Set switches by name for the body of a ``with`` statement, and restore them afterwards.
@@ -45,9 +32,12 @@ def switched(**switches: bool) -> Iterator[None]:
     Raises:
         ValueError: There is no such switch.
     """
+    unknown = sorted(set(switches) - set(SKIPS))
+    if unknown:
+        raise ValueError(f"unknown switches {', '.join(unknown)}; there are {', '.join(SKIPS)}")
     before = dict(_ON)
     try:
-        switch(**switches)
+        _ON.update(switches)
         yield
     finally:
         _ON.update(before)

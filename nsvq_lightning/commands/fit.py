@@ -22,7 +22,6 @@ from nsvq_lightning.commands.settings import configs_among, find_config, setting
 from nsvq_lightning.data.colmap import check_name
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.io.atomic import optional, write_text
-from nsvq_lightning.skips import SKIPS, switch, switched
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import check_settings, read_checkpoint
 from nsvq_lightning.training.run_folder import is_fast_dev_run, reserve, run_folder
@@ -102,8 +101,7 @@ class SplatCLI(LightningCLI):
     """``nsvq fit | validate | test | predict | export``.
 
     The callbacks of a run have options of their own: ``--callbacks.density.max_splats=200000`` changes one number
-    without repeating a list; ``trainer.callbacks`` takes further callbacks. So do the switches of
-    :mod:`nsvq_lightning.skips`: ``--skips.blocks=false``.
+    without repeating a list; ``trainer.callbacks`` takes further callbacks.
     """
 
     def __init__(self, args: list[str]) -> None:
@@ -118,20 +116,19 @@ class SplatCLI(LightningCLI):
             if f"--callbacks.{name}.help" in args:
                 sys.stdout.write(class_help(f"callbacks.{name}", kind))
                 raise SystemExit(0)
-        with switched():  # they hold for this command only
-            super().__init__(
-                SplatModule,
-                ColmapDataModule,
-                trainer_class=SplatTrainer,
-                trainer_defaults=TRAINER_DEFAULTS,
-                save_config_callback=RunStart,
-                seed_everything_default=False,  # every draw has its own generator
-                parser_class=QuietParser,
-                parser_kwargs={"prog": "nsvq", **PARSER_SETTINGS},
-                subclass_mode_data=True,
-                auto_configure_optimizers=False,  # the module builds its groups
-                args=args,
-            )
+        super().__init__(
+            SplatModule,
+            ColmapDataModule,
+            trainer_class=SplatTrainer,
+            trainer_defaults=TRAINER_DEFAULTS,
+            save_config_callback=RunStart,
+            seed_everything_default=False,  # every draw has its own generator
+            parser_class=QuietParser,
+            parser_kwargs={"prog": "nsvq", **PARSER_SETTINGS},
+            subclass_mode_data=True,
+            auto_configure_optimizers=False,  # the module builds its groups
+            args=args,
+        )
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
@@ -139,9 +136,7 @@ class SplatCLI(LightningCLI):
         return {**LightningCLI.subcommands(), "export": {"model", "datamodule"}}
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """Add the callbacks and the switches."""
-        for name, about in SKIPS.items():
-            parser.add_argument(f"--skips.{name}", type=bool, default=True, help=about)
+        """Add the callbacks."""
         for name, kind in STANDARD.items():
             key = f"callbacks.{name}"
             default = None if name in OPTIONAL else {"class_path": f"{kind.__module__}.{kind.__qualname__}"}
@@ -169,10 +164,6 @@ class SplatCLI(LightningCLI):
         for part in (self._get(self.config, "model"), self._get(self.config, "data").get("init_args", {})):
             if part.get("seed") == 0:  # the default: a seed that was asked for stays
                 part["seed"] = seed
-
-    def before_instantiate_classes(self) -> None:
-        """Set the switches."""
-        switch(**self._get(self.config, "skips").as_dict())
 
     def _parse_ckpt_path(self) -> None:
         """Take the model's settings from the checkpoint, except those on the command line; in ``fit``, take none.

@@ -143,7 +143,7 @@ def command_help(parser: LightningArgumentParser, command: str) -> str:
         parser: Its parser, with options named ``group.name``.
         command: Its name.
     """
-    groups: dict[str, list[Option]] = {name: [] for name in ("run", "callbacks", "model", "skips", "trainer")}
+    groups: dict[str, list[Option]] = {name: [] for name in ("run", "callbacks", "model", "trainer")}
     for option in _options(parser):
         group = option.name.partition(".")[0] if "." in option.name else "run"
         if group in groups and option.name not in (*groups, "model.splats"):
@@ -161,7 +161,6 @@ def command_help(parser: LightningArgumentParser, command: str) -> str:
     parts += [
         _section("callbacks", groups["callbacks"], "Their options: --callbacks.density.help; null leaves one out."),
         _section("model", groups["model"]),
-        _section("skips", groups["skips"]),
         _section("trainer", explained),
         *_wrapped(f"Lightning's own: {' '.join(others)}", "  "),
         "\n--model.quantizer.help=CLASS lists the options of a quantizer; another class for a callback is\n"

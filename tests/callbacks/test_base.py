@@ -156,7 +156,6 @@ OUT_OF_RANGE = [
     (BudgetedGrowth, {"overshoot": 0.9}, "overshoot must be at least 1, got 0.9"),
     (SplatSelection, {"budget": 0}, "budget must be at least 1, got 0"),
     (OpacityRegularization, {"weight": -1.0}, "weight must be at least 0, got -1.0"),
-    (CodebookInit, {"weights": "area"}, "weights must be 'none' or 'contribution', got 'area'"),
     (CodebookInit, {"values_per_splat": math.inf}, "values_per_splat must be above 0, got inf"),
     (CodebookRefit, {"steps": 0}, "steps must be at least 1, got 0"),
     (CodebookReplacement, {"early_end": 100}, "needs start <= early_end <= end, got 10700, 100 and 12000"),

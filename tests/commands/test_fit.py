@@ -15,7 +15,6 @@ from small_demo import write_small_demo
 from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.io.nsvq.file import read_nsvq
-from nsvq_lightning.skips import is_on
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -55,20 +54,6 @@ def test_a_run_leaves_scene_report_config_and_checkpoint(finished: Path) -> None
     assert metrics["level"] == "compact"
     assert metrics["paper_level"]["file_bytes"] > metrics["file_bytes"]
     assert [end["phase"] for end in metrics["phases"]] == [phase.name.lower() for phase in Phase]
-
-
-def test_switches_are_options_that_hold_for_one_command(
-    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[tuple[bool, bool]] = []
-
-    def look(module: SplatModule) -> None:
-        seen.append((is_on("blocks"), is_on("saturated")))
-
-    monkeypatch.setattr(SplatModule, "on_train_end", look)
-    assert main(fit(demo_scene, tmp_path, "--model.codebooks=null", "--skips.blocks=false", steps=2)) == 0
-    assert seen == [(False, True)]
-    assert is_on("blocks")
 
 
 @pytest.mark.parametrize(

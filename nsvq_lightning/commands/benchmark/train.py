@@ -9,7 +9,7 @@ import logging
 import tempfile
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean, median
@@ -25,6 +25,7 @@ from nsvq_lightning.commands.fit import SplatCLI
 from nsvq_lightning.commands.settings import find_config
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.report.numbers import evaluate
+from nsvq_lightning.skips import switched
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -128,13 +129,12 @@ QUICK_DEMO = ("--data.factor=4",)
 WATCHING = ("report", "export", "predictions", "checkpoint", "progress")
 
 
-def _train(scope: Scope, clock: StepClock, options: Sequence[str] = ()) -> int:
+def _train(scope: Scope, clock: StepClock) -> int:
     """Train ``scope.steps`` iterations of the config on the scene, or on the demo scene if that is no folder of photos.
 
     Args:
         scope: Says which config, scene, first splats and length.
         clock: Times the steps.
-        options: Further ones of ``nsvq fit``.
 
     Returns:
         Number of splats at the end.
@@ -159,7 +159,6 @@ def _train(scope: Scope, clock: StepClock, options: Sequence[str] = ()) -> int:
                 "--trainer.enable_progress_bar=false",
                 "--trainer.enable_checkpointing=false",
                 *(f"--callbacks.{name}=null" for name in WATCHING),
-                *options,
             ]
             module: SplatModule = _Run(arguments, clock).model
     finally:
@@ -174,14 +173,15 @@ def _config(scope: Scope) -> str:
 def run(scope: Scope) -> Iterator[Measurement]:
     """Train as shipped, with each inverted switch that is asked for, and on each emulated number of cores."""
     regions = Regions() if scope.emulate else None
-    variants: dict[str, tuple[str, ...]] = {"as shipped": ()}
-    variants |= {f"no skip of {name}": (f"--skips.{name}=false",) for name in scope.switches}
+    variants: dict[str, dict[str, bool]] = {"as shipped": {}}
+    variants |= {f"no skip of {name}": {name: False} for name in scope.switches}
     # Not counted, through all phases: kernels are loaded, and compiled where they never were.
     _train(replace(scope, steps=8), StepClock())
     clocks = {name: StepClock() for name in variants}
     rounds = 1 if scope.quick else 2
     for name in [*variants, *reversed(variants)][: rounds * len(variants)]:
-        splats = _train(scope, clocks[name], variants[name])
+        with switched(**variants[name]):
+            splats = _train(scope, clocks[name])
     if regions is not None:
         parts = RegionClock(regions)
         regions.emulate(max(scope.emulate))

@@ -162,7 +162,7 @@ def store_color(state, o, color):
 
 
 @inline
-def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
+def blend_block(block, count, batch, grid, state, touched, first):
     """Blend a batch into one block; returns the block's bit, or 0 once all its pixels are closed."""
     o = 16 * block
     t = simd.load(state, T + o)
@@ -188,7 +188,7 @@ def blend_block(block, count, batch, grid, state, touched, first, drop_closed):
         kept = blend_one(batch, r1, a1, t1, t2, kept)
         kept = blend_one(batch, r2, a2, t2, t3, kept)
         kept = blend_one(batch, r3, a3, t3, t4, kept)
-        if drop_closed and simd.mask_bits(t4 >= TRANSMITTANCE_MIN) == 0:
+        if simd.mask_bits(t4 >= TRANSMITTANCE_MIN) == 0:
             for j in range(j3 + 1, count):
                 simd.put(touched, first + j, simd.get(touched, first + j) & ~bit)
             bit = 0
@@ -233,9 +233,8 @@ def write_block(block, corner, size, background, state, planes):
 
 
 @inline
-def blend_tile(records, entries, begin, end, corner, size, background, grid, touched, planes, state, skips):
+def blend_tile(records, entries, begin, end, corner, size, background, grid, touched, planes, state, cull_blocks):
     """Blend one tile; returns the end of the part of its list that was processed."""
-    cull_blocks, drop_closed = skips
     columns, rows = F(size[0] - corner[0]), F(size[1] - corner[1])
     alive = 0
     for block in range(BLOCKS):
@@ -275,7 +274,7 @@ def blend_tile(records, entries, begin, end, corner, size, background, grid, tou
         while reached != 0:
             block = simd.lowest_bit(reached)
             reached &= reached - 1
-            if blend_block(block, count, batch, grid, state, touched, i, drop_closed) == 0:
+            if blend_block(block, count, batch, grid, state, touched, i) == 0:
                 alive &= ~(1 << block)
         i += count
     for block in range(BLOCKS):
@@ -294,16 +293,18 @@ def tile_corner(tile, group_columns):
 
 
 @parallel
-def blend(tile, tiles, records, entries, offsets, group_columns, size, background, grid, touched, ends, planes, skips):
+def blend(
+    tile, tiles, records, entries, offsets, group_columns, size, background, grid, touched, ends, planes, cull_blocks
+):  # fmt: skip
     """Blend a tile; a pixel depends only on its own one.
 
-    ``size`` is width and height, ``planes`` are image, transmittance, depth and alpha. ``skips`` says whether to skip
-    the blocks that a splat cannot reach, and those whose pixels are all closed.
+    ``size`` is width and height, ``planes`` are image, transmittance, depth and alpha. ``cull_blocks`` says
+    whether to skip the blocks that a splat cannot reach.
     """
     begin, end = np.int64(offsets[tile]), np.int64(offsets[tile + 1])
     ends[tile] = blend_tile(
         records, entries, begin, end, tile_corner(tile, group_columns), size, background, grid, touched, planes,
-        simd.scratch(FORWARD_SCRATCH), skips,
+        simd.scratch(FORWARD_SCRATCH), cull_blocks,
     )  # fmt: skip
 
 

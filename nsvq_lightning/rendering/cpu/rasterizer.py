@@ -163,7 +163,7 @@ class _Blend(torch.autograd.Function):
         behind = flat_checked("background", background.contiguous(), (3,))
         blending.blend(
             frame.tiles, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.size, behind, _GRID,
-            frame.touched, frame.ends, tuple(map(flat, planes)), (is_on("blocks"), is_on("saturated")),
+            frame.touched, frame.ends, tuple(map(flat, planes)), is_on("blocks"),
         )  # fmt: skip
         ctx.frame = frame
         ctx.set_materialize_grads(False)

@@ -125,13 +125,13 @@ def test_runs_with_and_without_a_switch(monkeypatch: pytest.MonkeyPatch) -> None
     seen, measured = set(), train._test_psnr
 
     def seeing_switches(module: SplatModule) -> float:
-        seen.add(is_on("saturated"))
+        seen.add(is_on("blocks"))
         return measured(module)
 
     monkeypatch.setattr(train, "_test_psnr", seeing_switches)
-    shipped, exact = rows = list(train.run(_tiny(switches=("saturated",))))
+    shipped, exact = rows = list(train.run(_tiny(switches=("blocks",))))
     _checked(rows)
-    assert [row.method for row in rows] == ["as shipped", "no skip of saturated"]
+    assert [row.method for row in rows] == ["as shipped", "no skip of blocks"]
     assert seen == {True, False}
     assert shipped.values["PSNR dB"] == exact.values["PSNR dB"] > 5
     assert exact.values["saves %"] == pytest.approx(100 * (1 - 1 / exact.values["times as shipped"]))

@@ -233,12 +233,12 @@ class Recording(NSVQ):
 
 
 def test_kmeans_gets_contributions_as_weights(run: RunFactory, recipe: Recipe) -> None:
-    for weights in ("none", "contribution"):
-        callbacks = recipe(codebook_init=CodebookInit(weights=weights)).values()  # type: ignore[arg-type]
+    for weighted in (False, True):
+        callbacks = recipe(codebook_init=CodebookInit(weighted=weighted)).values()
         _, module = run(callbacks, module={"quantizer": Recording}, max_steps=12)
         found = {name: quantizer.weight for name, quantizer in module.quantizers.items()}  # type: ignore[attr-defined]
-        weighted = {name for name, weight in found.items() if weight is not None}
-        assert weighted == (set() if weights == "none" else {"quats", "sh0", "shN"})
+        names = {name for name, weight in found.items() if weight is not None}
+        assert names == ({"quats", "sh0", "shN"} if weighted else set())
     assert found["quats"].shape == (len(module.splats),)
     assert found["quats"].min() > 0
     assert found["quats"].max() > 2 * found["quats"].mean()

@@ -313,7 +313,7 @@ def test_a_loss_that_is_known_only_after_the_backward_pass_changes_no_bit(
 def test_codebooks_are_placed_on_finite_splats(
     with_density: bool, run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
 ) -> None:
-    callbacks = recipe(codebook_init=CodebookInit(weights="contribution"), canonical=None)
+    callbacks = recipe(codebook_init=CodebookInit(), canonical=None)
     if not with_density:
         del callbacks["density"]
     # After the search at the end of the prune phase, and before the form of the covariances is chosen.

@@ -45,7 +45,7 @@ RECIPE = [
     *(f"--callbacks.density.{name}={value}" for name, value in {**GROWTH, "first_prune": 3}.items()),
     *("--callbacks.rate_decay.start=50", "--callbacks.sh_degree.every=10"),
     *("--callbacks.codebook_replacement.start=45", "--callbacks.codebook_replacement.early_end=45"),
-    "--callbacks.codebook_init.weights=none",  # contributions are sums over views, whose order differs
+    "--callbacks.codebook_init.weighted=false",  # contributions are sums over views, whose order differs
     *("--callbacks.codebook_replacement.end=47", "--callbacks.codebook_replacement.late_every=2"),
 ]
 PAPER = [
