@@ -1,4 +1,4 @@
-"""What L1 and D-SSIM are: in plain torch, which is their definition, and for kernels.
+"""What the losses are: in plain torch, which is their definition, and for kernels.
 
 The algebra of kernels is the same code on a CPU and on a GPU (:mod:`nsvq_lightning.compute.formulas`). There, p is the
 image, q the target, in [0, 1]. Their *moments* are p, q, p² + q² and p·q.
@@ -15,6 +15,9 @@ from nsvq_lightning.compute.jit import F, inline
 SSIM_RADIUS = 5
 SSIM_SIGMA = 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+# Where the loss is for PSNR: weight of the logarithm of the mean squared error, 0.0028 for a decibel; and what is added
+# to that error, as nobody sees what is beyond 50 dB.
+LOG_WEIGHT, LEAST_ERROR = 0.012, 1e-5
 C1, C2 = F(SSIM_C1), F(SSIM_C2)
 
 
@@ -62,12 +65,17 @@ def similarity(m1, m2, squares, product):
 
 
 @inline
-def pixel_gradient(raw, p, q, derivatives, l1_step, ssim_step):
-    """Gradient of the loss from the blurred derivatives of SSIM, 0 where the image was clamped."""
+def pixel_gradient(raw, p, q, derivatives, steps):
+    """Gradient of the loss, 0 where the image was clamped, from the blurred derivatives of SSIM.
+
+    ``steps`` are the weights of the sums of absolute differences, of half the squared differences, and of SSIM.
+    """
+    l1_step, l2_step, ssim_step = steps
     by_mean, by_square, by_product = derivatives
     g = simd.fma(q, by_product, simd.fma(2 * p, by_square, by_mean))
     sign = simd.where(p > q, l1_step, simd.where(p < q, -l1_step, 0.0))
-    return simd.where((raw >= 0) & (raw <= 1), simd.fma(-ssim_step, g, sign), 0.0)
+    slope = simd.fma(l2_step, p - q, sign)
+    return simd.where((raw >= 0) & (raw <= 1), simd.fma(-ssim_step, g, slope), 0.0)
 
 
 def ssim_window() -> Tensor:

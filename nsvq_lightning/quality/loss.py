@@ -1,5 +1,8 @@
 """The photometric loss: (1 - λ)·L1 + λ·(1 - SSIM) (Kerbl et al. 2023, eq. 7), without the pixels that do not count.
 
+In place of L1 it can have a multiple of -PSNR, the logarithm of the mean squared error, which pictures are measured by.
+As that of a photo is relative to its own error, those that splats can show well count as much as the others.
+
 No loss and no metric depends on masked pixels. Both pictures are black there, as the structural similarity takes them
 to be beyond their borders, and means are over the pixels that count.
 """
@@ -12,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.quality.formulas import check_pair, in_range, plain_ssim
+from nsvq_lightning.quality.formulas import LEAST_ERROR, LOG_WEIGHT, check_pair, in_range, plain_ssim
 
 
 def apply_mask(image: Tensor, mask: Tensor | None) -> Tensor:
@@ -44,13 +47,17 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         return 1 - mean_of_kept(1 - ssim(apply_mask(image, mask), apply_mask(target, mask)), mask)
     kernels = None if torch.is_grad_enabled() and image.requires_grad else _kernels(image, target)
     if kernels is not None:
-        loss: Tensor = kernels.l1_dssim(image.contiguous(), target.contiguous(), 1.0, derived=False)[0]
+        loss: Tensor = kernels.fused_loss(image.contiguous(), target.contiguous(), 1.0, derived=False)[0]
         return (1 - loss).to(image)
     return plain_ssim(*in_range(image, target))
 
 
-def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
+def photometric_loss(
+    image: Tensor, target: Tensor, dssim_weight: float = 0.2, mask: Tensor | None = None, *, psnr: bool = False
+) -> Tensor:
     """(1 - λ)·mean abs(image - target) + λ·(1 - SSIM), differentiable in ``image``, which is clamped to [0, 1] first.
+
+    With ``psnr``, 0.012·ln(mean square(image - target) + 1e-5) takes the place of the mean absolute difference.
 
     float32 images take fused kernels for clamping, loss and gradient; everything else is plain torch.
 
@@ -59,24 +66,33 @@ def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float = 0.2, m
         target: Photo ``[H, W, 3]``, uint8 or in [0, 1].
         dssim_weight: λ in [0, 1].
         mask: Which pixels count ``[H, W]`` bool, see :mod:`nsvq_lightning.quality.loss`; None if all do.
+        psnr: Whether to train for PSNR instead of L1.
 
     Raises:
         ValueError: The shapes differ.
     """
     check_pair(image, target, mask)
     if mask is not None:
-        return mean_of_kept(photometric_loss(apply_mask(image, mask), apply_mask(target, mask), dssim_weight), mask)
+        masked = apply_mask(image, mask), apply_mask(target, mask)
+        if not psnr:
+            return mean_of_kept(photometric_loss(*masked, dssim_weight), mask)
+        # Only 1 - SSIM is a mean over the pixels; the logarithm of one has the same slope over all of them.
+        scaled = dssim_weight / max(float(mask.float().mean()), LEAST_ERROR)
+        total = scaled + 1 - dssim_weight
+        return total * photometric_loss(*masked, scaled / total, psnr=True)
     kernels = _kernels(image, target)
     if kernels is not None:
-        loss: Tensor = _Loss.apply(image, target, dssim_weight, kernels)  # type: ignore[no-untyped-call]
+        loss: Tensor = _Loss.apply(image, target, dssim_weight, psnr, kernels)  # type: ignore[no-untyped-call]
         return loss
-    return plain_loss(image, target, dssim_weight)
+    return plain_loss(image, target, dssim_weight, psnr=psnr)
 
 
-def plain_loss(image: Tensor, target: Tensor, dssim_weight: float) -> Tensor:
+def plain_loss(image: Tensor, target: Tensor, dssim_weight: float, *, psnr: bool = False) -> Tensor:
     """The loss of images ``[H, W, 3]`` in plain torch, in the type of the first one."""
     image, target = in_range(image, target)
-    return (1 - dssim_weight) * (image - target).abs().mean() + dssim_weight * (1 - plain_ssim(image, target))
+    difference = image - target
+    error = LOG_WEIGHT * (difference.square().mean() + LEAST_ERROR).log() if psnr else difference.abs().mean()
+    return (1 - dssim_weight) * error + dssim_weight * (1 - plain_ssim(image, target))
 
 
 def _kernels(image: Tensor, target: Tensor) -> Any:
@@ -89,16 +105,14 @@ def _kernels(image: Tensor, target: Tensor) -> Any:
 
 class _Loss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, dssim_weight: float, kernels: Any) -> Tensor:
+    def forward(ctx: Any, image: Tensor, target: Tensor, dssim_weight: float, psnr: bool, kernels: Any) -> Tensor:
         image, target = image.contiguous(), target.contiguous()
-        loss, derivatives = kernels.l1_dssim(image, target, dssim_weight, derived=ctx.needs_input_grad[0])
-        ctx.dssim_weight, ctx.kernels = dssim_weight, kernels
-        ctx.save_for_backward(image, target, derivatives)
+        loss, *saved = kernels.fused_loss(image, target, dssim_weight, psnr=psnr, derived=ctx.needs_input_grad[0])
+        ctx.kernels = kernels
+        ctx.save_for_backward(image, target, *saved)
         return loss.to(image)  # type: ignore[no-any-return]  # of modules that are found by their name
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, scale: Tensor) -> tuple[Tensor, None, None, None]:
-        image, target, derivatives = ctx.saved_tensors
-        gradient = ctx.kernels.l1_dssim_backward(image, target, ctx.dssim_weight, derivatives, scale)
-        return gradient, None, None, None
+    def backward(ctx: Any, scale: Tensor) -> tuple[Tensor, None, None, None, None]:
+        return ctx.kernels.fused_loss_backward(*ctx.saved_tensors, scale), None, None, None, None

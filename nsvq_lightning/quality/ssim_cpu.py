@@ -1,9 +1,10 @@
-"""L1 and D-SSIM with their gradient in one sweep down an image.
+"""The photometric loss with its gradient in one sweep down an image.
 
 Each row is read once: it is clamped and brought to [0, 1] as it enters a ring buffer of eleven rows. Five rows later
 come the vertical blur of the four moment planes, their horizontal blur, SSIM, its three derivative planes, and the
 horizontal blur of those into a second ring buffer; another five rows later their vertical blur, which is the gradient
-(the blur is its own adjoint). Only these rows are ever in memory.
+(the blur is its own adjoint). Only these rows are ever in memory. The gradient of PSNR depends on the error of the
+whole picture, which a first, short sweep adds up.
 """
 
 import numpy as np
@@ -122,7 +123,7 @@ def blur_across(ring, y, plane, x, pitch):
 
 
 @inline
-def gradient_of_row(image, gradient, images, ring, y, length, pitch, l1_step, ssim_step, lanes):
+def gradient_of_row(image, gradient, images, ring, y, length, pitch, steps, lanes):
     """Gradient of the loss at row y, 0 where the image was clamped; returns the row's sum of absolute differences."""
     total = simd.broadcast(0)
     lane = simd.load(lanes, 0)
@@ -133,16 +134,31 @@ def gradient_of_row(image, gradient, images, ring, y, length, pitch, l1_step, ss
         raw = simd.load(image, y * length + x)
         o = PAD + x
         slopes = blur_across(ring, y, 0, o, pitch), blur_across(ring, y, 1, o, pitch), blur_across(ring, y, 2, o, pitch)
-        g = formulas.pixel_gradient(raw, p, q, slopes, l1_step, ssim_step)
+        g = formulas.pixel_gradient(raw, p, q, slopes, steps)
         simd.store(gradient, y * length + x, g)
         total = total + simd.where(lane >= F(x_ - x), simd.abs(p - q), 0)
     return simd.lane_sum(total)
 
 
 @parallel
+def square_errors(thread, threads, image, target, white, height, length, pitch, images, lanes, sums):
+    """Every thread adds up the squared differences of each row of a band, into ``sums[2·y]``."""
+    own_images, lane = images[thread], simd.load(lanes, 0)
+    for y in range(height * thread // threads, height * (thread + 1) // threads):
+        take_row(image, target, white, own_images, y, height, length, pitch)
+        total = simd.broadcast(0)
+        for x_ in range(0, length, 16):
+            x = min(x_, length - 16)
+            o = row_of(y, IMAGES, pitch) + x
+            difference = simd.load(own_images, o) - simd.load(own_images, o + pitch)
+            total = simd.fma(difference, simd.where(lane >= F(x_ - x), difference, 0), total)
+        sums[2 * y] = simd.lane_sum(total)
+
+
+@parallel
 def sweep_image(
-    thread, threads, image, target, white, gradient, height, length, pitch, l1_step, ssim_step, images, moments,
-    derivatives, ring, lanes, sums,
+    thread, threads, image, target, white, gradient, height, length, pitch, steps, images, moments, derivatives, ring,
+    lanes, sums,
 ):  # fmt: skip
     """Every thread sweeps a band of rows; a row's result does not depend on the band it is in.
 
@@ -170,17 +186,20 @@ def sweep_image(
         done = y - SSIM_RADIUS
         if done >= first:
             sums[2 * done + 1] = gradient_of_row(
-                image, gradient, own_images, own_ring, done, length, pitch, l1_step, ssim_step, lanes
+                image, gradient, own_images, own_ring, done, length, pitch, steps, lanes
             )
 
 
-def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float, *, derived: bool = True) -> tuple[Tensor, Tensor]:
+def fused_loss(
+    image: Tensor, target: Tensor, dssim_weight: float, *, psnr: bool = False, derived: bool = True
+) -> tuple[Tensor, Tensor]:
     """Loss, a float64 scalar, and its gradient by ``image``, which is clamped to [0, 1] first; W must be at least 6.
 
     Args:
         image: Contiguous float32 ``[H, W, 3]`` on the CPU.
         target: Contiguous ``[H, W, 3]``, float32 in [0, 1] or uint8.
         dssim_weight: Share of 1 - SSIM.
+        psnr: Whether the rest is for PSNR instead of L1.
         derived: As for :mod:`nsvq_lightning.quality.ssim_cuda`; here the gradient comes along in any case.
 
     Raises:
@@ -208,18 +227,24 @@ def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float, *, derived: boo
     derivatives.fill(0)
     sums = work.array("row_sums", 2 * height, np.float64)
     count = length * height
+    white, lanes = F(255 if of_bytes else 1), np.arange(16, dtype=np.float32)
+    share = 1 - dssim_weight
+    l1_step, l2_step = share / count, 0.0
+    if psnr:
+        square_errors(threads, pixels, wanted, white, height, length, pitch, images, lanes, sums)
+        squares = sums[0::2].sum() / count + formulas.LEAST_ERROR
+        l1_step, l2_step = 0.0, 2 * share * formulas.LOG_WEIGHT / (count * squares)
     sweep_image(
-        threads, pixels, wanted, F(255 if of_bytes else 1), flat(gradient), height, length, pitch,
-        F((1 - dssim_weight) / count), F(dssim_weight / count), images, moments, derivatives, ring,
-        np.arange(16, dtype=np.float32), sums,
+        threads, pixels, wanted, white, flat(gradient), height, length, pitch,
+        (F(l1_step), F(l2_step), F(dssim_weight / count)), images, moments, derivatives, ring, lanes, sums,
     )  # fmt: skip
-    similarity, difference = sums[0::2].sum() / count, sums[1::2].sum() / count
+    similarity = sums[0::2].sum() / count
+    error = formulas.LOG_WEIGHT * np.log(squares) if psnr else sums[1::2].sum() / count
     work.give_back()
-    loss = (1 - dssim_weight) * difference + dssim_weight * (1 - similarity)
-    return torch.tensor(loss, dtype=torch.float64), gradient
+    return torch.tensor(share * error + dssim_weight * (1 - similarity), dtype=torch.float64), gradient
 
 
-def l1_dssim_backward(image: Tensor, target: Tensor, dssim_weight: float, gradient: Tensor, scale: Tensor) -> Tensor:
-    """Gradient ``[H, W, 3]`` of ``scale`` times the loss by ``image``, from the one that :func:`l1_dssim` returned."""
+def fused_loss_backward(image: Tensor, target: Tensor, gradient: Tensor, scale: Tensor) -> Tensor:
+    """Gradient ``[H, W, 3]`` of ``scale`` times the loss by ``image``, from that which :func:`fused_loss` returned."""
     # With one view per step the scale is 1, and skipping a pass over the image pays.
     return gradient if scale == 1 else gradient * scale

@@ -1,4 +1,4 @@
-"""L1 and D-SSIM with their gradient: four passes over the image, each one half of a separable blur.
+"""The photometric loss with its gradient: four passes over the image, each one half of a separable blur.
 
 Forward: vertical blur of the four moment planes, then their horizontal blur, SSIM and its derivatives with respect to
 three of the blurred planes. Backward: vertical and horizontal blur of these derivatives (the blur is its own adjoint),
@@ -25,6 +25,7 @@ formulas = for_triton(shared)
 
 # The taps of the window, from the middle outwards.
 TAPS, RADIUS = tl.constexpr(tuple(ssim_window()[SSIM_RADIUS:].tolist())), tl.constexpr(SSIM_RADIUS)
+LOG_WEIGHT, LEAST_ERROR = tl.constexpr(shared.LOG_WEIGHT), tl.constexpr(shared.LEAST_ERROR)
 DERIVATIVES = 3
 # Image rows per program: four floats per thread, so that registers suffice for all taps.
 ROWS = 4
@@ -93,13 +94,15 @@ def pixels(image, target, at, down, BYTES: tl.constexpr):
 
 @triton.jit
 def moments_kernel(
-    image, target, moments, sums, height, length, BYTES: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr
+    image, target, moments, sums, height, length, PSNR: tl.constexpr, BYTES: tl.constexpr, ROWS: tl.constexpr,
+    COLUMNS: tl.constexpr,
 ):  # fmt: skip
-    """Vertical blur of the four moment planes; sum of the absolute differences into ``sums[2·program]``."""
+    """Vertical blur of the four moment planes; sum of absolute or squared differences into ``sums[2·program]``."""
     at = place(height, length, ROWS, COLUMNS)
     p, q = pixels(image, target, at, 0, BYTES)
     # Beyond the border both are 0.
-    tl.store(sums + 2 * program_number(), tl.sum(tl.sum(tl.abs(p - q), 1), 0))
+    error = (p - q) * (p - q) if PSNR else tl.abs(p - q)
+    tl.store(sums + 2 * program_number(), tl.sum(tl.sum(error, 1), 0))
     blurred = formulas.moments(TAPS[0], p, q)
     for k in tl.static_range(1, RADIUS + 1):
         p, q = pixels(image, target, at, -k, BYTES)
@@ -144,8 +147,11 @@ def similarity_kernel(
 
 
 @triton.jit
-def loss_kernel(sums, loss, programs, count, dssim_weight, BLOCK: tl.constexpr):
-    """Add up the sums of all programs, in float64: (1 - w)·Σ|p - q|/n + w·(1 - ΣSSIM/n)."""
+def loss_kernel(sums, loss, programs, count, dssim_weight, PSNR: tl.constexpr, BLOCK: tl.constexpr):
+    """Add up the sums of all programs, in float64; the loss is followed by the steps of its gradient.
+
+    It is (1 - w)·Σ|p - q|/n + w·(1 - ΣSSIM/n), the first sum replaced by 0.012·ln(Σ(p - q)²/n + 1e-5) for PSNR.
+    """
     difference = tl.zeros([BLOCK], tl.float64)
     similarity = tl.zeros([BLOCK], tl.float64)
     for start in range(0, programs, BLOCK):
@@ -153,8 +159,16 @@ def loss_kernel(sums, loss, programs, count, dssim_weight, BLOCK: tl.constexpr):
         difference += tl.load(sums + 2 * program, mask=program < programs, other=0.0).to(tl.float64)
         similarity += tl.load(sums + 2 * program + 1, mask=program < programs, other=0.0).to(tl.float64)
     weight = tl.cast(dssim_weight, tl.float64)
-    value = (1 - weight) * (tl.sum(difference, 0) / count) + weight * (1 - tl.sum(similarity, 0) / count)
-    tl.store(loss, value.to(tl.float32))
+    error = tl.sum(difference, 0) / count
+    l1_step, l2_step = (1 - weight) / count, (1 - weight) * 0.0
+    if PSNR:
+        error += LEAST_ERROR
+        l1_step, l2_step = l2_step, l1_step * (2 * LOG_WEIGHT) / error
+        error = LOG_WEIGHT * tl.log(error)
+    value = (1 - weight) * error + weight * (1 - tl.sum(similarity, 0) / count)
+    numbers = (value, l1_step, l2_step, weight / count)
+    for k in tl.static_range(len(numbers)):
+        tl.store(loss + k, numbers[k].to(tl.float32))
 
 
 @triton.jit
@@ -168,8 +182,8 @@ def spread_kernel(derivatives, blurred, height, length, ROWS: tl.constexpr, COLU
 
 @triton.jit
 def gradient_kernel(
-    image, target, blurred, scale, gradient, height, length, l1_step, ssim_step, BYTES: tl.constexpr,
-    ROWS: tl.constexpr, COLUMNS: tl.constexpr,
+    image, target, blurred, steps, scale, gradient, height, length, BYTES: tl.constexpr, ROWS: tl.constexpr,
+    COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """Gradient of ``scale`` times the loss, 0 where the image was clamped."""
     at = place(height, length, ROWS, COLUMNS)
@@ -177,7 +191,8 @@ def gradient_kernel(
     raw = load_at(image, at, 0, 0)
     p, q = pixels(image, target, at, 0, BYTES)
     slopes = (blur_along(blurred, at), blur_along(squares, at), blur_along(products, at))
-    value = formulas.pixel_gradient(raw, p, q, slopes, l1_step, ssim_step)
+    steps = (tl.load(steps), tl.load(steps + 1), tl.load(steps + 2))
+    value = formulas.pixel_gradient(raw, p, q, slopes, steps)
     store_at(gradient, at, value * tl.load(scale))
 
 
@@ -211,16 +226,20 @@ class _Launch(NamedTuple):
         return cls(grid, (height, 3 * width), of_bytes, {"ROWS": ROWS, "COLUMNS": COLUMNS, **COMPILE})
 
 
-def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float, *, derived: bool = True) -> tuple[Tensor, Tensor]:
-    """Loss of ``image``, which is clamped to [0, 1] first, a float32 scalar on the device; and derivatives of SSIM.
+def fused_loss(
+    image: Tensor, target: Tensor, dssim_weight: float, *, psnr: bool = False, derived: bool = True
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Loss of ``image``, which is clamped to [0, 1] first, a float32 scalar on the device; and what its gradient needs.
 
-    The derivatives, with respect to blurred p, p² and p·q, are ``[3, H, W, 3]``.
+    That is derivatives of SSIM with respect to blurred p, p² and p·q ``[3, H, W, 3]``, and the steps ``[3]`` of
+    :func:`nsvq_lightning.quality.formulas.pixel_gradient`.
 
     Args:
         image: Contiguous float32 ``[H, W, 3]`` on a CUDA device, H and W at least 1.
         target: Contiguous ``[H, W, 3]`` there, float32 in [0, 1] or uint8.
         dssim_weight: Share of 1 - SSIM.
-        derived: Whether :func:`l1_dssim_backward` will follow; without it there are no derivatives.
+        psnr: Whether the rest is for PSNR instead of L1.
+        derived: Whether :func:`fused_loss_backward` will follow; without it there are no derivatives.
 
     Raises:
         ValueError: The pictures differ in shape or device or are not ``[H, W, 3]``, or one is not contiguous.
@@ -231,38 +250,35 @@ def l1_dssim(image: Tensor, target: Tensor, dssim_weight: float, *, derived: boo
     moments = image.new_empty(MOMENTS, *image.shape)
     planes = image.new_empty(DERIVATIVES, *image.shape) if derived else moments
     sums = image.new_empty(programs, 2)
-    loss = image.new_empty(())
+    loss = image.new_empty(4)
     with torch.cuda.device_of(image):
-        moments_kernel[grid](image, target, moments, sums, *size, BYTES=of_bytes, **tile)
+        moments_kernel[grid](image, target, moments, sums, *size, PSNR=psnr, BYTES=of_bytes, **tile)
         similarity_kernel[grid](moments, planes, sums, *size, DERIVED=derived, **tile)
-        loss_kernel[(1,)](sums, loss, programs, image.numel(), dssim_weight, BLOCK=BLOCK, **COMPILE)
-    return loss, planes
+        loss_kernel[(1,)](sums, loss, programs, image.numel(), dssim_weight, PSNR=psnr, BLOCK=BLOCK, **COMPILE)
+    return loss[0], planes, loss[1:]
 
 
-def l1_dssim_backward(image: Tensor, target: Tensor, dssim_weight: float, derivatives: Tensor, scale: Tensor) -> Tensor:
+def fused_loss_backward(image: Tensor, target: Tensor, derivatives: Tensor, steps: Tensor, scale: Tensor) -> Tensor:
     """Gradient ``[H, W, 3]`` of ``scale`` times the loss with respect to ``image``.
 
     Args:
-        image: As in :func:`l1_dssim`.
-        target: As in :func:`l1_dssim`.
-        dssim_weight: As in :func:`l1_dssim`.
-        derivatives: What :func:`l1_dssim` returned.
+        image: As in :func:`fused_loss`.
+        target: As in :func:`fused_loss`.
+        derivatives: What :func:`fused_loss` returned.
+        steps: What :func:`fused_loss` returned.
         scale: float32 scalar on the device.
 
     Raises:
-        ValueError: As in :func:`l1_dssim`, or the derivatives belong to another picture.
+        ValueError: As in :func:`fused_loss`, or the derivatives belong to another picture.
         TypeError: A dtype is wrong.
     """
     grid, size, of_bytes, tile = _Launch.on(image, target)
     check_tensor("derivatives", derivatives, (DERIVATIVES, *image.shape), image.device)
+    check_tensor("steps", steps, (3,), image.device)
     check_tensor("scale", scale, (), image.device)
-    count = image.numel()
     blurred = torch.empty_like(derivatives)
     gradient = torch.empty_like(image)
     with torch.cuda.device_of(image):
         spread_kernel[(*grid, DERIVATIVES)](derivatives, blurred, *size, **tile)
-        gradient_kernel[grid](
-            image, target, blurred, scale, gradient, *size, (1 - dssim_weight) / count, dssim_weight / count,
-            BYTES=of_bytes, **tile,
-        )  # fmt: skip
+        gradient_kernel[grid](image, target, blurred, steps, scale, gradient, *size, BYTES=of_bytes, **tile)
     return gradient

@@ -62,6 +62,7 @@ class SplatModule(LightningModule):
         background: Colour behind the splats; ``auto``: white for NeRF-synthetic scenes, black for others; ``random``
             draws a new one each step and tests on black.
         dssim_weight: Share of 1 - SSIM in the loss; the rest is L1.
+        psnr_loss: Train for PSNR instead of L1 from the prune phase on, when splats no longer grow.
         rates: Learning rates.
         backend: Rasterizer, see :func:`nsvq_lightning.render`.
         antialiased: Render with anti-aliasing.
@@ -108,6 +109,7 @@ class SplatModule(LightningModule):
         codebooks: str | dict[str, int] | None = "4k",
         background: Literal["auto", "black", "white", "random"] = "auto",
         dssim_weight: float = 0.2,
+        psnr_loss: bool = True,
         rates: optim.LearningRates = optim.LearningRates(),  # noqa: B008  frozen
         backend: str = "auto",
         antialiased: bool = False,
@@ -129,6 +131,7 @@ class SplatModule(LightningModule):
         }
         self.background: str = background
         self.dssim_weight = dssim_weight
+        self.psnr_loss = psnr_loss
         # A checkpoint stores these two as plain dictionaries.
         self.rates = optim.LearningRates(**rates) if isinstance(rates, Mapping) else rates
         self.storage = Storage.from_dict(storage) if isinstance(storage, Mapping) else storage
@@ -428,8 +431,9 @@ class SplatModule(LightningModule):
 
 
 def _photometric_term(module: SplatModule, rendered: Render, view: View) -> Tensor:
-    """(1 - w)·L1 + w·(1 - SSIM) of picture and photo (paper, section 3.3)."""
-    return photometric_loss(rendered.image, view.image, module.dssim_weight, view.mask)
+    """(1 - w)·L1 + w·(1 - SSIM) of picture and photo (paper, section 3.3); later for PSNR."""
+    late = module.psnr_loss and module.phase > Phase.WARMUP
+    return photometric_loss(rendered.image, view.image, module.dssim_weight, view.mask, psnr=late)
 
 
 def _is_finite(loss: AsyncScalar, view: str, step: int) -> bool:

@@ -40,6 +40,7 @@ def test_against_the_oracle(cases: str) -> None:
 REGISTERS = {
     "project_kernel": 80,
     "project_backward_kernel": 72,
+    "take_kernel": 32,
     "blend_kernel": 112,
     "blend_backward_kernel": 152,
     "total_kernel": 104,
@@ -70,7 +71,7 @@ SAMPLED_REGISTERS = 24
     [
         "radii blend search_45",
         pytest.param(
-            "project_0 project_3 project_sampled tiles blend_and_observe loss loss_of_one_row",
+            "project_0 project_3 project_sampled tiles blend_and_observe loss loss_for_psnr loss_of_one_row",
             marks=pytest.mark.slow,
         ),
         pytest.param("nearest_3 nearest_45 search_3 substitute_3 substitute_45 sums_3 sums_45", marks=pytest.mark.slow),
@@ -103,7 +104,7 @@ def test_no_kernel_is_left_out() -> None:
 @pytest.mark.parametrize(
     ("kernels", "changing"),
     [
-        ("rendering.cuda.projection: project project_backward", "n"),
+        ("rendering.cuda.projection: project project_backward take", "n"),
         ("rendering.cuda.blend: total", "count"),
         ("rendering.cuda.binning: expand", "total count halvings"),
         ("quantize.cuda.search: nearest check queue search snapshot", "count"),

@@ -47,9 +47,10 @@ def test_gradient_of_a_pixel() -> None:
     q, by_mean, by_square, by_product = random(4, 40)
     p = raw.clamp(0, 1)
     similarity = by_mean * p + by_square * p * p + by_product * p * q
-    (expected,) = torch.autograd.grad((0.8 * (p - q).abs() - 0.2 * similarity).sum(), raw)
+    error = 0.8 * (p - q).abs() + 0.15 * (p - q).square()
+    (expected,) = torch.autograd.grad((error - 0.2 * similarity).sum(), raw)
     raw = raw.detach()
     assert torch.equal(f.clamped(raw), raw.clamp(0, 1))
     assert f.clamped(torch.tensor(torch.nan, dtype=torch.float64)).isnan()
-    ours = f.pixel_gradient(raw, f.clamped(raw), q, (by_mean, by_square, by_product), 0.8, 0.2)
+    ours = f.pixel_gradient(raw, f.clamped(raw), q, (by_mean, by_square, by_product), (0.8, 0.3, 0.2))
     torch.testing.assert_close(ours, expected)

@@ -1,5 +1,7 @@
 """The photometric loss against scikit-image and against plain torch in float64."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -14,10 +16,13 @@ def pair(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
     return image, (image + 0.2 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1)
 
 
-def plain_loss(image: torch.Tensor, target: torch.Tensor, weight: float) -> torch.Tensor:
+def plain_loss(image: torch.Tensor, target: torch.Tensor, weight: float, *, psnr: bool) -> torch.Tensor:
     inside = (image >= 0) & (image <= 1)
     image = torch.where(inside, image, image.detach().clamp(0, 1))
-    return (1 - weight) * (image - target).abs().mean() + weight * (1 - ssim(image, target))
+    error = (image - target).abs().mean()
+    if psnr:
+        error = 0.012 * torch.log((image - target).square().mean() + 1e-5)
+    return (1 - weight) * error + weight * (1 - ssim(image, target))
 
 
 def test_ssim_is_scikit_images_on_a_zero_padded_image() -> None:
@@ -47,8 +52,9 @@ def test_pixels_at_the_limits_have_a_gradient(dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize(("height", "width"), [(64, 70), (1, 6), (3, 20), (12, 33), (30, 6), (200, 7), (9, 5)])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("psnr", [False, True])
 @pytest.mark.parametrize("kind", ["float", "bytes", "beyond"])
-def test_fused_loss_and_gradient(height: int, width: int, weight: float, kind: str) -> None:
+def test_fused_loss_and_gradient(height: int, width: int, weight: float, kind: str, psnr: bool) -> None:
     image, target = pair(height, width)
     if kind == "beyond":
         image = 1.5 * image - 0.25
@@ -56,8 +62,8 @@ def test_fused_loss_and_gradient(height: int, width: int, weight: float, kind: s
     if kind == "bytes":
         target = (255 * target).round().to(torch.uint8)
     fused, oracle = image.clone().requires_grad_(), image.double().requires_grad_()
-    loss = photometric_loss(fused, target, weight)
-    expected = plain_loss(oracle, target.double() / (255 if kind == "bytes" else 1), weight)
+    loss = photometric_loss(fused, target, weight, psnr=psnr)
+    expected = plain_loss(oracle, target.double() / (255 if kind == "bytes" else 1), weight, psnr=psnr)
     (3 * loss).backward()
     (3 * expected).backward()
     assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-6, abs=2e-7)
@@ -66,14 +72,15 @@ def test_fused_loss_and_gradient(height: int, width: int, weight: float, kind: s
     assert float((fused.grad - oracle.grad).norm() / oracle.grad.norm()) < 1e-6
 
 
-def test_bits_do_not_depend_on_the_number_of_threads() -> None:
+@pytest.mark.parametrize("psnr", [False, True])
+def test_bits_do_not_depend_on_the_number_of_threads(psnr: bool) -> None:
     image, target = pair(100, 64)
     results = []
     before = torch.get_num_threads()
     for threads in (1, 2):
         torch.set_num_threads(threads)
         leaf = image.clone().requires_grad_()
-        loss = photometric_loss(leaf, target)
+        loss = photometric_loss(leaf, target, psnr=psnr)
         loss.backward()
         results.append((loss.detach(), leaf.grad))
     torch.set_num_threads(before)
@@ -83,10 +90,21 @@ def test_bits_do_not_depend_on_the_number_of_threads() -> None:
     assert torch.equal(results[0][1], results[1][1])
 
 
-def test_a_loss_that_is_no_number_stays_none() -> None:
+@pytest.mark.parametrize("psnr", [False, True])
+def test_a_loss_that_is_no_number_stays_none(psnr: bool) -> None:
     image, target = pair(20, 20)
     image[3, 4, 1] = torch.nan
-    assert not torch.isfinite(photometric_loss(image, target))
+    assert not torch.isfinite(photometric_loss(image, target, psnr=psnr))
+
+
+def test_a_perfect_picture_has_the_least_loss_and_no_slope() -> None:
+    photo, _ = pair(20, 20)
+    leaf = photo.clone().requires_grad_()
+    loss = photometric_loss(leaf, photo, 0.0, psnr=True)
+    loss.backward()
+    assert float(loss.detach()) == pytest.approx(0.012 * math.log(1e-5))
+    assert leaf.grad is not None
+    assert leaf.grad.eq(0).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -115,7 +133,8 @@ def test_ssim_does_not_depend_on_who_computes_it() -> None:
         torch.testing.assert_close(values[2].float(), values[0], atol=1e-5, rtol=0)
 
 
-def test_a_mask_takes_pixels_out_of_loss_gradient_and_similarity() -> None:
+@pytest.mark.parametrize("psnr", [False, True])
+def test_a_mask_takes_pixels_out_of_loss_gradient_and_similarity(psnr: bool) -> None:
     """Whatever the excluded pixels show, in either picture; the rest is as if it were the picture's own border."""
     image, photo = pair(20, 24)
     mask = torch.ones(image.shape[:2], dtype=torch.bool)
@@ -123,16 +142,18 @@ def test_a_mask_takes_pixels_out_of_loss_gradient_and_similarity() -> None:
     cut = image[:, :9].contiguous(), photo[:, :9].contiguous()
     for weight in (0.0, 0.2, 1.0):
         leaf, part = image.clone().requires_grad_(), cut[0].clone().requires_grad_()
-        loss, expected = photometric_loss(leaf, photo, weight, mask), photometric_loss(part, cut[1], weight)
+        loss = photometric_loss(leaf, photo, weight, mask, psnr=psnr)
+        expected = photometric_loss(part, cut[1], weight, psnr=psnr)
         loss.backward()
         expected.backward()
         assert (leaf.grad[:, 9:] == 0).all()
         if weight == 0:
-            torch.testing.assert_close(loss, expected)
-            torch.testing.assert_close(leaf.grad[:, :9], part.grad)
+            if not psnr:  # whose logarithm has another constant
+                torch.testing.assert_close(loss, expected)
+            torch.testing.assert_close(leaf.grad[:, :9], part.grad, rtol=1e-3, atol=1e-9)
         other = torch.where(mask[..., None], image, torch.rand_like(image))
         torch.testing.assert_close(
-            photometric_loss(other, torch.where(mask[..., None], photo, 1 - photo), weight, mask), loss
+            photometric_loss(other, torch.where(mask[..., None], photo, 1 - photo), weight, mask, psnr=psnr), loss
         )
     same = torch.where(mask[..., None], photo, torch.rand_like(photo))
     assert float(ssim(same, photo, mask)) == pytest.approx(1, abs=1e-6)

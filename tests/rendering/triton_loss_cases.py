@@ -30,12 +30,13 @@ def pair(height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
     ("height", "width", "weight", "bytes_"),
     [(9, 43, 0.2, True), (1, 1, 1.0, False), (17, 5, 0.0, False)],
 )
-def test_loss_and_gradient(height: int, width: int, weight: float, bytes_: bool) -> None:
+@pytest.mark.parametrize("psnr", [False, True])
+def test_loss_and_gradient(height: int, width: int, weight: float, bytes_: bool, psnr: bool) -> None:
     image, target = pair(height, width)
     photo = (255 * target).round().to(torch.uint8) if bytes_ else target
     leaf, oracle = image.to(DEVICE).requires_grad_(), image.double().requires_grad_()
-    loss = photometric_loss(leaf, photo.to(DEVICE), weight)
-    expected = photometric_loss(oracle, photo.double() / 255 if bytes_ else photo.double(), weight)
+    loss = photometric_loss(leaf, photo.to(DEVICE), weight, psnr=psnr)
+    expected = photometric_loss(oracle, photo.double() / 255 if bytes_ else photo.double(), weight, psnr=psnr)
     (gradient,) = torch.autograd.grad(3 * loss, leaf, retain_graph=True)
     (expected_gradient,) = torch.autograd.grad(3 * expected, oracle)
     assert loss.dtype == torch.float32
@@ -65,7 +66,8 @@ def test_strided_images() -> None:
     torch.testing.assert_close(leaf.grad.cpu().double(), oracle.grad, rtol=1e-4, atol=1e-8)
 
 
-def test_a_loss_that_is_no_number_stays_none() -> None:
+@pytest.mark.parametrize("psnr", [False, True])
+def test_a_loss_that_is_no_number_stays_none(psnr: bool) -> None:
     image, target = pair(12, 12)
     image[3, 4, 1] = torch.nan
-    assert photometric_loss(image.to(DEVICE), target.to(DEVICE)).isnan()
+    assert photometric_loss(image.to(DEVICE), target.to(DEVICE), psnr=psnr).isnan()

@@ -77,9 +77,9 @@ def render(*, everything: bool) -> None:
     )  # fmt: skip
 
 
-def loss(height: int, dtype: torch.dtype) -> None:
+def loss(height: int, dtype: torch.dtype, *, psnr: bool = False) -> None:
     image = tensor(height, WIDTH, 3).requires_grad_()
-    photometric_loss(image, tensor(height, WIDTH, 3, dtype=dtype)).backward()
+    photometric_loss(image, tensor(height, WIDTH, 3, dtype=dtype), psnr=psnr).backward()
 
 
 def search(dim: int) -> None:
@@ -106,6 +106,7 @@ CASES: dict[str, Callable[[], object]] = {
     "blend": lambda: render(everything=False),
     "blend_and_observe": lambda: render(everything=True),
     "loss": lambda: loss(HEIGHT, torch.uint8),
+    "loss_for_psnr": lambda: loss(HEIGHT, torch.uint8, psnr=True),
     "loss_of_one_row": lambda: loss(1, torch.float32),
     "nearest_3": lambda: nearest_codes(tensor(SPLATS, 3), tensor(4096, 3)),
     "nearest_45": lambda: nearest_codes(tensor(SPLATS, 45), tensor(4096, 45)),

@@ -117,7 +117,7 @@ def draw(width: int, height: int, backend: str, **options: Any) -> None:
     visible(leaves, camera, backend=backend)
     result = render(leaves, camera, pixel_weights=some_pixel_weights(camera), backend=backend, **options)
     photo = torch.rand(height, width, 3, generator=generator(0))
-    losses = [photometric_loss(result.image, target) for target in (photo, (255 * photo).byte())]
+    losses = [photometric_loss(result.image, photo), photometric_loss(result.image, (255 * photo).byte(), psnr=True)]
     (sum(losses) + result.alpha.sum() + result.depth.sum()).backward()
 
 

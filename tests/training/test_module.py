@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render, visible
@@ -108,6 +109,19 @@ def test_fine_tuning_trains_codebooks_positions_and_opacities_only(module: Splat
     assert book.any()
 
 
+@pytest.mark.parametrize("wanted", [True, False])
+def test_the_loss_is_for_psnr_once_splats_no_longer_grow(wanted: bool, module: SplatModule) -> None:
+    module.psnr_loss = wanted
+    photo = torch.rand(30, 40, 3)
+    view = View("a.png", 0, camera(), photo)
+    with torch.no_grad():
+        rendered = module(view.camera)
+        for phase in Phase:
+            module.phase = phase
+            expected = photometric_loss(rendered.image, photo, 0.2, psnr=wanted and phase is not Phase.WARMUP)
+            assert torch.equal(module.loss_terms["photometric"](rendered, view), expected)
+
+
 def test_random_backgrounds_change_with_the_step_and_not_in_evaluation(module: SplatModule) -> None:
     random = SplatModule(sh_degree=1, codebooks=None, background="random", splats=make_splats())
     random._trainer = module._trainer
@@ -129,7 +143,9 @@ def test_a_loss_that_is_not_finite_skips_the_update(
 ) -> None:
     view = View("a.png", 0, camera(), torch.zeros(30, 40, 3, dtype=torch.uint8))
     assert module.training_step(view, 0) is not None
-    monkeypatch.setattr("nsvq_lightning.training.module.photometric_loss", lambda image, *_: image.sum() * torch.nan)
+    monkeypatch.setattr(
+        "nsvq_lightning.training.module.photometric_loss", lambda image, *_, **__: image.sum() * torch.nan
+    )
     assert module.training_step(view, 0) is None
     assert "the loss of a.png is nan, no update" in caplog.text
 

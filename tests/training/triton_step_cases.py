@@ -120,7 +120,7 @@ def step(module: SplatModule, view: View, optimizer: torch.optim.Optimizer) -> N
     optimizer.step()
 
 
-RENDER = ["project_kernel", "expand_kernel", "blend_kernel"]
+RENDER = ["project_kernel", *2 * ["take_kernel"], "expand_kernel", "blend_kernel"]
 LOSS = ["moments_kernel", "similarity_kernel", "loss_kernel"]
 BACK = ["spread_kernel", "gradient_kernel", "blend_backward_kernel", "total_kernel", "project_backward_kernel"]
 SEARCH = ["drift_kernel", "check_kernel", "queue_kernel", "search_kernel", "snapshot_kernel", "substitute_kernel"]
