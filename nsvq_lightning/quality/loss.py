@@ -57,7 +57,7 @@ def photometric_loss(
 ) -> Tensor:
     """(1 - λ)·mean abs(image - target) + λ·(1 - SSIM), differentiable in ``image``, which is clamped to [0, 1] first.
 
-    With ``psnr``, 0.012·ln(mean square(image - target) + 1e-5) takes the place of the mean absolute difference.
+    With ``psnr``, 0.016·ln(mean square(image - target) + 1e-5) takes the place of the mean absolute difference.
 
     float32 images take fused kernels for clamping, loss and gradient; everything else is plain torch.
 

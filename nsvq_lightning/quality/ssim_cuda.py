@@ -150,7 +150,7 @@ def similarity_kernel(
 def loss_kernel(sums, loss, programs, count, dssim_weight, PSNR: tl.constexpr, BLOCK: tl.constexpr):
     """Add up the sums of all programs, in float64; the loss is followed by the steps of its gradient.
 
-    It is (1 - w)·Σ|p - q|/n + w·(1 - ΣSSIM/n), the first sum replaced by 0.012·ln(Σ(p - q)²/n + 1e-5) for PSNR.
+    It is (1 - w)·Σ|p - q|/n + w·(1 - ΣSSIM/n), the first sum replaced by 0.016·ln(Σ(p - q)²/n + 1e-5) for PSNR.
     """
     difference = tl.zeros([BLOCK], tl.float64)
     similarity = tl.zeros([BLOCK], tl.float64)

@@ -21,7 +21,7 @@ def plain_loss(image: torch.Tensor, target: torch.Tensor, weight: float, *, psnr
     image = torch.where(inside, image, image.detach().clamp(0, 1))
     error = (image - target).abs().mean()
     if psnr:
-        error = 0.012 * torch.log((image - target).square().mean() + 1e-5)
+        error = 0.016 * torch.log((image - target).square().mean() + 1e-5)
     return (1 - weight) * error + weight * (1 - ssim(image, target))
 
 
@@ -102,7 +102,7 @@ def test_a_perfect_picture_has_the_least_loss_and_no_slope() -> None:
     leaf = photo.clone().requires_grad_()
     loss = photometric_loss(leaf, photo, 0.0, psnr=True)
     loss.backward()
-    assert float(loss.detach()) == pytest.approx(0.012 * math.log(1e-5))
+    assert float(loss.detach()) == pytest.approx(0.016 * math.log(1e-5))
     assert leaf.grad is not None
     assert leaf.grad.eq(0).all()
 
