@@ -1,6 +1,7 @@
 """Settings of ``nsvq fit`` as they are typed: configs by name, short options, and what is refused without Lightning."""
 
 import argparse
+import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
@@ -204,6 +205,7 @@ def check_config(path: str) -> dict[str, Any]:
         # Not the parser's loader: what is nested too deep would overflow its stack.
         loader = yaml.SafeLoader(file.read_text(encoding="utf-8"))
         settings = loader.get_single_data()
+        json.dumps(settings, default=str)  # refuses what holds itself
     except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error
     if not isinstance(settings, dict):

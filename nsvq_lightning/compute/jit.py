@@ -183,7 +183,8 @@ def in_parallel(typingctx: Any, helper: Any, parts: Any, arguments: Any) -> Any:
         base, moves, counts = (cgutils.alloca_once_value(builder, value) for value in (_byte_p(None), _i64(0), count))
         pointers = [builder.bitcast(pointer, _byte_p) for pointer in (share, base, counts, moves, state)]
         run = cgutils.get_or_insert_function(builder.module, _PARALLEL_FOR, "numba_parallel_for")
-        with builder.if_else(builder.icmp_signed(">", values[1], _i64(1))) as (several, one):
+        several = builder.and_(*(builder.icmp_signed(">", number, _i64(1)) for number in (values[1], count)))
+        with builder.if_else(several) as (several, one):
             with several:
                 builder.call(run, [*pointers, _i64(0), _i64(1), count])
             with one:

@@ -14,6 +14,7 @@ from torch import Tensor
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat, flat_checked, recycled
+from nsvq_lightning.compute.rows import share
 from nsvq_lightning.quality import formulas
 from nsvq_lightning.quality.formulas import SSIM_RADIUS, check_pair, ssim_window
 
@@ -144,7 +145,8 @@ def gradient_of_row(image, gradient, images, ring, y, length, pitch, steps, lane
 def square_errors(thread, threads, image, target, white, height, length, pitch, images, lanes, sums):
     """Every thread adds up the squared differences of each row of a band, into ``sums[2·y]``."""
     own_images, lane = images[thread], simd.load(lanes, 0)
-    for y in range(height * thread // threads, height * (thread + 1) // threads):
+    first, last = share(height, thread, threads)
+    for y in range(first, last):
         take_row(image, target, white, own_images, y, height, length, pitch)
         total = simd.broadcast(0)
         for x_ in range(0, length, 16):
@@ -166,7 +168,7 @@ def sweep_image(
     """
     own_images, own_ring = images[thread], ring[thread]
     own_moments, own_derivatives = moments[thread], derivatives[thread]
-    first, last = height * thread // threads, height * (thread + 1) // threads
+    first, last = share(height, thread, threads)
     for y in range(first - 2 * SSIM_RADIUS, first):
         take_row(image, target, white, own_images, y, height, length, pitch)
     for y in range(first - SSIM_RADIUS, last + SSIM_RADIUS):
@@ -228,12 +230,12 @@ def fused_loss(
     sums = work.array("row_sums", 2 * height, np.float64)
     count = length * height
     white, lanes = F(255 if of_bytes else 1), np.arange(16, dtype=np.float32)
-    share = 1 - dssim_weight
-    l1_step, l2_step = share / count, 0.0
+    error_weight = 1 - dssim_weight
+    l1_step, l2_step = error_weight / count, 0.0
     if psnr:
         square_errors(threads, pixels, wanted, white, height, length, pitch, images, lanes, sums)
         squares = sums[0::2].sum() / count + formulas.LEAST_ERROR
-        l1_step, l2_step = 0.0, 2 * share * formulas.LOG_WEIGHT / (count * squares)
+        l1_step, l2_step = 0.0, 2 * error_weight * formulas.LOG_WEIGHT / (count * squares)
     sweep_image(
         threads, pixels, wanted, white, flat(gradient), height, length, pitch,
         (F(l1_step), F(l2_step), F(dssim_weight / count)), images, moments, derivatives, ring, lanes, sums,
@@ -241,7 +243,7 @@ def fused_loss(
     similarity = sums[0::2].sum() / count
     error = formulas.LOG_WEIGHT * np.log(squares) if psnr else sums[1::2].sum() / count
     work.give_back()
-    return torch.tensor(share * error + dssim_weight * (1 - similarity), dtype=torch.float64), gradient
+    return torch.tensor(error_weight * error + dssim_weight * (1 - similarity), dtype=torch.float64), gradient
 
 
 def fused_loss_backward(image: Tensor, target: Tensor, gradient: Tensor, scale: Tensor) -> Tensor:

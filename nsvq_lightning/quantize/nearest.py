@@ -20,6 +20,7 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import parallel, parts_of
 from nsvq_lightning.compute.memory import Array
+from nsvq_lightning.compute.rows import share
 from nsvq_lightning.quantize.box_search import MAX_DIM, box_search, code_distances, place_of_least
 from nsvq_lightning.quantize.scores import score_search
 
@@ -155,7 +156,7 @@ def _search_kernel(dim: int) -> Any:
 
     def search(part, parts, x, prices, table, result):
         blocks = table.shape[0] // (16 * (dim + 1))
-        for i in range(result.shape[0] * part // parts, result.shape[0] * (part + 1) // parts):
+        for i in range(*share(result.shape[0], part, parts)):
             price = simd.get(prices, i)
             best, block_of = simd.broadcast(np.inf), simd.broadcast(0)
             for block in range(blocks):

@@ -23,7 +23,7 @@ from torch import Tensor
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import check_tensor, flat, outside, recycled
-from nsvq_lightning.compute.rows import clear, clear_between, count_outside
+from nsvq_lightning.compute.rows import clear, clear_between, count_outside, share
 from nsvq_lightning.quantize.scores import new_lanes
 
 _UNIT, _TINY, _MINUS_TWO_LN2 = F(2.0**-24), np.finfo(np.float32).tiny, F(-2 * np.log(2))
@@ -232,7 +232,7 @@ def _backward(dim: int) -> Any:
 
     def backward(part, parts, grad, x, rows, codebook, codes, out, grad_x, sums):
         count = codes.shape[0]
-        begin, stop = count * part // parts, count * (part + 1) // parts
+        begin, stop = share(count, part, parts)
         found = _outside(dim, x, rows, codebook, codes, begin, stop)
         if found == 0:
             clear(sums[part], 0, sums.shape[1])

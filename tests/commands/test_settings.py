@@ -96,6 +96,7 @@ def test_values_are_found_by_the_name_that_an_option_has_without_its_class() -> 
         (b"\xff\xfe\0", "is not YAML .*can't decode"),
         (b"#" * 200_000, "has 200000 bytes"),
         (b"[" * 100_000, "is not YAML .*recursion"),
+        (b"a: &a {b: *a}", "is not YAML .*Circular"),
     ],
 )
 def test_what_cannot_be_a_config(tmp_path: Path, content: bytes, message: str) -> None:

@@ -150,7 +150,9 @@ def test_a_mask_takes_pixels_out_of_loss_gradient_and_similarity(psnr: bool) -> 
         if weight == 0:
             if not psnr:  # whose logarithm has another constant
                 torch.testing.assert_close(loss, expected)
-            torch.testing.assert_close(leaf.grad[:, :9], part.grad, rtol=1e-3, atol=1e-9)
+            # In the part, so little more is added to the mean squared error.
+            tolerance = {"rtol": 1e-3, "atol": 1e-9} if psnr else {}
+            torch.testing.assert_close(leaf.grad[:, :9], part.grad, **tolerance)
         other = torch.where(mask[..., None], image, torch.rand_like(image))
         torch.testing.assert_close(
             photometric_loss(other, torch.where(mask[..., None], photo, 1 - photo), weight, mask, psnr=psnr), loss

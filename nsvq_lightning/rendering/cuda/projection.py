@@ -146,7 +146,7 @@ def take_kernel(table, ids, n, taken, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
 
 def _take(table: Tensor, ids: Tensor) -> Tensor:
     """Rows ``ids [V]`` of a table ``[N, WIDTH]`` of at most 16 columns."""
-    (n,), width = ids.shape, table.shape[1]
+    n, width = len(ids), table.shape[1]
     taken = table.new_empty(n, width)
     if n:
         take_kernel[(triton.cdiv(n, BLOCK),)](table, ids, n, taken, WIDTH=width, BLOCK=BLOCK, **COMPILE)

@@ -243,12 +243,13 @@ class Plant(Callback):
 def test_a_run_whose_codes_turn_non_finite_goes_on(
     run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
 ) -> None:
-    _, module = run([Plant(31, 58), *recipe(codebook_finite=FiniteCodes(every=4)).values()])
+    callbacks = [Plant(31, 58), *recipe(codebook_finite=FiniteCodes(every=4)).values()]
+    _, module = run(callbacks, module={"psnr_loss": False})  # too short a run for it
     assert all(bool(quantizer.codebook.isfinite().all()) for quantizer in module.quantizers.values())
     found = [message for message in caplog.messages if "codes of sh0 are non-finite" in message]
     # Frozen codes are drawn: the loss shows a broken one at once, not only at the next check.
     assert [message.split(" codes")[0] for message in found] == ["step 32: 1 of 16", "step 59: 1 of 16"]
-    assert 9 < module.history[-1]["psnr"] < 100
+    assert 10 < module.history[-1]["psnr"] < 100
 
 
 class PlantSplats(Callback):
