@@ -17,7 +17,7 @@ from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
 from nsvq_lightning.io.numbers import FLAT, finite_logits, finite_logs, logits_of, opacity_of
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
-from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s, Uint32s
+from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s
 
 _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _TYPES = {
@@ -373,14 +373,17 @@ def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, 
 
 def _of_chunks(vertices: NDArray[np.void], bounds: Float32s) -> dict[str, Float64s]:
     """Rows ``[N, D]`` of each attribute of packed splats, which begin with a chunk."""
-    shares = {name: _unpacked(vertices[name], *places) for name, places in _PACKED.items()}
-    largest = (vertices["packed_rotation"] >> 30).astype(np.intp)
+    shares = {}
+    for name, (lowest, largest) in _PACKED.items():
+        numbers = vertices[name][:, None] >> np.array(lowest, np.uint32) & np.array(largest, np.uint32)
+        shares[name] = numbers / largest
+    dropped = (vertices["packed_rotation"] >> 30).astype(np.intp)
     rows: dict[str, Arrays] = {
         "means": shares["packed_position"],
         "scales": shares["packed_scale"],
         "sh0": shares["packed_color"][:, :3],
         "opacities": logits_of(shares["packed_color"][:, 3:]),
-        "quats": conventions.from_smallest_three(largest, (shares["packed_rotation"] - 0.5) * math.sqrt(2)),
+        "quats": conventions.from_smallest_three(dropped, (shares["packed_rotation"] - 0.5) * math.sqrt(2)),
     }
     ends = np.split(_for_each(bounds, len(vertices)), bounds.shape[1] // 3, axis=1)
     for part, low, high in zip(rows.values(), ends[::2], ends[1::2], strict=False):
@@ -396,11 +399,6 @@ def _table(path: StrPath, header: PlyHeader) -> NDArray[np.void]:
 def _for_each(bounds: Float32s, count: int) -> Float64s:
     """The bounds ``[N, ...]`` of each splat from those of chunks."""
     return bounds[: -(-count // _CHUNK)].repeat(_CHUNK, axis=0)[:count].astype(np.float64)
-
-
-def _unpacked(words: Uint32s, lowest: Sequence[int], largest: Sequence[int]) -> Float64s:
-    """Numbers in words ``[N]``, from these bits on, as shares of the largest ``[N, len(lowest)]``."""
-    return (words[:, None] >> np.array(lowest, np.uint32) & np.array(largest, np.uint32)) / largest
 
 
 def write_ply(path: StrPath, scene: CompressedScene) -> int:
@@ -449,15 +447,18 @@ def _packed_part(scene: CompressedScene) -> dict[str, NDArray[np.void]]:
     bounds = np.stack([each.reduceat(values, starts) for each in (np.minimum, np.maximum)], axis=2)
     low, high = np.moveaxis(_for_each(bounds, len(scene)), 2, 0)
     shares = (values - low) / np.where(high > low, high - low, 1)
-    largest, others = conventions.smallest_three(conventions.unit(scene.rows("quats")))
+    dropped, others = conventions.smallest_three(conventions.unit(scene.rows("quats")))
     parts = {
         "packed_position": shares[:, 0],
         "packed_rotation": others / math.sqrt(2) + 0.5,
         "packed_scale": shares[:, 1],
         "packed_color": np.c_[shares[:, 2], opacity_of(scene.opacities)],
     }
-    words = {name: _packed(parts[name], *places) for name, places in _PACKED.items()}
-    words["packed_rotation"] |= largest.astype(np.uint32) << 30
+    words = {}
+    for name, (lowest, largest) in _PACKED.items():
+        numbers = np.rint(parts[name].clip(0, 1) * largest).astype(np.uint32)
+        words[name] = np.bitwise_or.reduce(numbers << np.array(lowest, np.uint32), axis=1)
+    words["packed_rotation"] |= dropped.astype(np.uint32) << 30
     tables = {"chunk": dict(zip(_BOUNDS, bounds.reshape(len(starts), -1).T, strict=True)), "vertex": words}
     if scene.sh_degree:
         levels = np.clip(32 * _by_color(scene.rows("shN")) + 128, 0, 255).astype(np.uint8)
@@ -484,12 +485,6 @@ def write_elements(path: StrPath, elements: Mapping[str, NDArray[np.void]], anti
         for rows in elements.values():
             file.write(rows.astype(rows.dtype.newbyteorder("<"), copy=False).tobytes())
         return file.tell()
-
-
-def _packed(shares: Float64s, lowest: Sequence[int], largest: Sequence[int]) -> Uint32s:
-    """Invert :func:`_unpacked`, to the nearest numbers."""
-    numbers = np.rint(shares.clip(0, 1) * largest).astype(np.uint32)
-    return np.asarray(np.bitwise_or.reduce(numbers << np.array(lowest, np.uint32), axis=1))
 
 
 def plain_ply_bytes(splats: int, sh_degree: int) -> int:
