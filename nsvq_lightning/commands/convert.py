@@ -141,7 +141,7 @@ def _edited(scene: CompressedScene, options: argparse.Namespace) -> CompressedSc
     if options.up is not None:
         scene = placing.rotated(scene, placing.turn_up(_up(options), options.up))
     if options.matrix is not None:
-        scene = placing.moved(scene, np.array([*options.matrix, 0, 0, 0, 1]).reshape(4, 4))
+        scene = placing.moved(scene, np.reshape(options.matrix, (3, 4)))
     if options.align is not None:
         from nsvq_lightning.data.colmap import alignment
         from nsvq_lightning.data.transforms import read_poses

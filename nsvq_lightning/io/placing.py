@@ -40,10 +40,8 @@ HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
 def rotated(scene: CompressedScene, rotation: Float64s) -> CompressedScene:
-    """The scene turned about the world's origin by a rotation ``[3, 3]``, see :func:`moved`."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    return moved(scene, matrix)
+    """The scene turned about the world's origin, and scaled, by a matrix ``[3, 3]``, see :func:`moved`."""
+    return moved(scene, np.c_[rotation, np.zeros(3)])
 
 
 def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
@@ -54,7 +52,8 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
 
     Args:
         scene: The scene.
-        matrix: From old to new world coordinates ``[4, 4]``: a rotation times a positive number, and a translation.
+        matrix: From old to new world coordinates ``[3, 4]``: a rotation times a positive number, and a translation; a
+            fourth row may follow.
 
     Raises:
         ValueError: It stretches, mirrors or is not finite.

@@ -13,7 +13,7 @@ from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
 from nsvq_lightning.io.numbers import logits_of, logs_of_lengths, opacity_of
-from nsvq_lightning.io.placing import HALF_TURN, UP_AXES, moved, rotated
+from nsvq_lightning.io.placing import HALF_TURN, UP_AXES, rotated
 from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, sh_coefficients, unit
 
 log = logging.getLogger(__name__)
@@ -98,7 +98,7 @@ def read_usda(path: StrPath) -> CompressedScene:
             colors = colors.reshape(len(rows["means"]), -1)
             rows |= {"sh0": colors[:, :3], "shN": colors[:, 3:]}
             scene = CompressedScene.from_rows(rows, antialiased="bool antialiased = 1" in text)
-            return moved(scene, _to_ours(text))
+            return rotated(scene, _to_ours(text))
         except ValueError as error:
             raise FormatError(f"truncated or damaged: {error}") from None
 
@@ -117,11 +117,9 @@ def _rows(text: str, name: str, width: int) -> Float32s:
 
 
 def _to_ours(text: str) -> Float64s:
-    """What takes the axes and the unit of the stage to ours, and to metres where it states a unit ``[4, 4]``."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = HALF_TURN
+    """What takes the axes and the unit of the stage to ours, and to metres where it states a unit ``[3, 3]``."""
+    turn = HALF_TURN
     if re.search(r'\bupAxis\s*=\s*"Z"', text):
-        matrix[:3, :3] = HALF_TURN @ UP_AXES["z"]
-    if found := re.search(r"\bmetersPerUnit\s*=\s*([-+.\deE]+)", text):
-        matrix[:3, :3] *= float(found[1])
-    return matrix
+        turn = HALF_TURN @ UP_AXES["z"]
+    found = re.search(r"\bmetersPerUnit\s*=\s*([-+.\deE]+)", text)
+    return turn * float(found[1]) if found else turn
