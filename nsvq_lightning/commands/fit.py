@@ -250,7 +250,7 @@ class SplatCLI(LightningCLI):
         """Print a summary."""
         path = run_folder(self.trainer) / "metrics.json"
         if self.trainer.is_global_zero and path.is_file():
-            sys.stdout.write(summary(path.parent, json.loads(path.read_text(encoding="utf-8"))))
+            sys.stdout.write(summary(path.parent, json.loads(path.read_bytes())))
 
 
 def continuation(checkpoint: Path) -> str:

@@ -135,7 +135,7 @@ def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
         if outdated:
             write_text(scene / "sparse" / reconstruct.STAMPS, json.dumps(outdated))
     else:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(path.read_bytes())
         if found != record:
             raise ValueError(f"{scene} was prepared from {found.get('source')} or otherwise: --again begins anew")
     (scene / "images").mkdir(parents=True, exist_ok=True)

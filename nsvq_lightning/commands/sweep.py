@@ -320,7 +320,7 @@ def row_of(run: Run, error: str) -> Row:
         phase, None without codebooks; the version of the package that trained it; folder; error. What is not known, as
         in a failed run, is None.
     """
-    metrics = {} if error else json.loads((run.folder / "metrics.json").read_text(encoding="utf-8"))
+    metrics = {} if error else json.loads((run.folder / "metrics.json").read_bytes())
     return {
         **run.names,
         "psnr": metrics.get("psnr"),

@@ -66,7 +66,7 @@ class Block:
             SceneError: The folder has none, or it is damaged.
         """
         try:
-            return cls(**json.loads((folder / BLOCK).read_text(encoding="utf-8")))
+            return cls(**json.loads((folder / BLOCK).read_bytes()))
         except (OSError, ValueError, TypeError) as error:
             raise SceneError(f"{folder} is no part of a scene ({error}): make it anew with 'nsvq split'") from None
 

@@ -227,7 +227,7 @@ def _lens_of(path: Path) -> str:
 def stamps_in(folder: Path) -> dict[str, str]:
     """What the features or models in a folder were found in: for each photo lens model and checksum."""
     path = folder / STAMPS
-    return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
+    return dict(json.loads(path.read_bytes())) if path.is_file() else {}
 
 
 def remove_database(scene: Path) -> None:

@@ -263,7 +263,7 @@ def _frames(file: Path, allow_outside: bool) -> tuple[dict[str, Any], dict[str, 
         SceneError: It cannot be read or has no frames, one is no table of values, or two are of the same photo.
     """
     try:
-        head = json.loads(file.read_text(encoding="utf-8-sig"))
+        head = json.loads(file.read_bytes())
     except FileNotFoundError as error:
         raise SceneError(f"{file} does not exist: choose another file (--data.model)") from error
     except (OSError, ValueError, RecursionError) as error:

@@ -126,7 +126,7 @@ def read_camera_path(path: Path) -> tuple[list[Camera], float]:
         OSError: It cannot be read.
     """
     with _refused(f"{path} is not a camera path as nerfstudio and the viewer write them"):
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_bytes())
         entries = content.get("camera_path") or content["keyframes"]
         size = int(content["render_width"]), int(content["render_height"])
         cameras = [_entry_camera(entry, *size) for entry in entries]
@@ -182,7 +182,7 @@ def read_cameras(path: Path) -> dict[str, Camera]:
     cameras: dict[str, Camera] = {}
     advice = ": move it away, or name the photos with --data.root"
     with _refused(f"{path} is no list of cameras as INRIA's trainer writes it", advice):
-        for entry in json.loads(path.read_text(encoding="utf-8")):
+        for entry in json.loads(path.read_bytes()):
             rotation = np.array(entry["rotation"], np.float64)
             position = np.array(entry["position"], np.float64)
             width, height = int(entry["width"]), int(entry["height"])
