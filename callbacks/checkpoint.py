@@ -13,7 +13,7 @@ import torch
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
-from nsvq_lightning.io.atomic import atomic_path
+from nsvq_lightning.io.atomic import atomic_path, make_folder_of
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
@@ -211,6 +211,6 @@ class RunCheckpoint(WritingCallback, Checkpoint):
 def _write(trainer: Trainer, path: Path) -> None:
     """Write a checkpoint in one step; Lightning itself writes into the system's temporary folder and copies."""
     # weights_only=False here: save the optimiser's state too. The file holds plain data all the same.
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder_of(path)
     with atomic_path(path) if trainer.is_global_zero else nullcontext(path) as target:
         trainer.save_checkpoint(target, weights_only=False)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import add_root, known_views, positive, trained_scene
-from nsvq_lightning.io.atomic import write_bytes
+from nsvq_lightning.io.atomic import make_folder_of, write_bytes
 from nsvq_lightning.io.formats import FORMATS
 from nsvq_lightning.io.lod import NAME
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
@@ -139,7 +139,7 @@ def _write_levels(options: argparse.Namespace, compressor: "Compressor", most: i
 def _write_file(options: argparse.Namespace, compressor: "Compressor", most: int, views: str) -> None:
     """Write the ``.nsvq`` file of at most ``most`` splats that is asked for."""
     candidate = compressor.best(most, options.codebooks, options.target_bytes, options.max_error)
-    options.output.parent.mkdir(parents=True, exist_ok=True)
+    make_folder_of(options.output)
     write_bytes(options.output, candidate.data)
     before, after = options.input.stat().st_size, len(candidate.data)
     sizes = candidate.setting.codebooks

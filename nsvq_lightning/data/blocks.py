@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt
 from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.points import projected
 from nsvq_lightning.data.scene import Scene
-from nsvq_lightning.io.atomic import write_bytes, write_text
+from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
 from nsvq_lightning.io.placing import turn_up
 from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.rendering.camera import Camera
@@ -268,5 +268,5 @@ def _write_photo(folder: Path, index: int, image: Uint8s, mask: Bools, camera: C
 
 
 def _write_png(path: Path, pixels: Uint8s) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder_of(path)
     write_bytes(path, cv2.imencode(".png", np.ascontiguousarray(pixels))[1].tobytes())

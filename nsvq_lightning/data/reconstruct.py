@@ -28,7 +28,7 @@ from PIL.ExifTags import IFD, Base
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
 from nsvq_lightning.data.images import DAMAGED, ImageHead, read_image
 from nsvq_lightning.data.photo_files import PHOTOS
-from nsvq_lightning.io.atomic import write_bytes, write_text
+from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
 
 # Photos that are named; of the others, their number is.
 MAX_NAMED = 8
@@ -434,7 +434,7 @@ def _copy(path: Path, target: Path) -> Path:
         image.load()
         content = path.read_bytes() if as_is else _converted(image, path, kind)
     if target != path:
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_folder_of(target)
         write_bytes(target, content)
         os.utime(target, ns=(path.stat().st_atime_ns, path.stat().st_mtime_ns))
     elif not as_is:

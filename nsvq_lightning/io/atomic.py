@@ -66,6 +66,11 @@ def atomic_write(path: StrPath) -> Iterator[BinaryIO]:
         yield file
 
 
+def make_folder_of(path: Path) -> None:
+    """Make the folder that a file is to be in, and those around it, where they are missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+
 def write_bytes(path: StrPath, content: bytes) -> None:
     """Write a file in one step, see :func:`atomic_write`."""
     with atomic_write(path) as file:

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from nsvq_lightning.io.atomic import StrPath, write_bytes, write_text
+from nsvq_lightning.io.atomic import StrPath, make_folder_of, write_bytes, write_text
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, Json, naming_file
 from nsvq_lightning.io.sog import META, PALETTE_LIMIT, read_sog, sog_contents
@@ -57,7 +57,7 @@ def write_lod(
     old: list[str] = []
     with suppress(FileNotFoundError, FormatError):
         old = _index(target)["filenames"]
-    target.parent.mkdir(parents=True, exist_ok=True)
+    make_folder_of(target)
     folders: list[str] = []
     total = 0
     for number, splats in enumerate(levels):

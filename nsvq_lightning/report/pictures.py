@@ -22,7 +22,7 @@ import torch
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
-from nsvq_lightning.io.atomic import atomic_path, atomic_write, write_bytes
+from nsvq_lightning.io.atomic import atomic_path, atomic_write, make_folder_of, write_bytes
 from nsvq_lightning.splats.conventions import Uint8s
 from nsvq_lightning.training.schedule import Phase, Schedule
 
@@ -156,7 +156,7 @@ def frame_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
         fps: Frames per second.
     """
     if path.suffix:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder_of(path)
         with video_writer(path, width, height, fps) as add:
             yield lambda picture: add(as_bytes(picture))
     else:

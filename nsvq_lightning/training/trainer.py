@@ -10,6 +10,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import DDPStrategy
 
 from nsvq_lightning.compute.devices import best_device
+from nsvq_lightning.io.atomic import make_folder_of
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import PlainCheckpointIO, read_checkpoint
@@ -78,7 +79,7 @@ class SplatTrainer(Trainer):
         model.on_load_checkpoint(checkpoint)
         model.load_state_dict(checkpoint["state_dict"])
         path = Path(output)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder_of(path)
         scene = model.compressed()
         save(scene, path, model.storage)
         log.info("wrote %s: %d splats, %d bytes", path, len(scene), path.stat().st_size)
