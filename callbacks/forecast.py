@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from lightning.pytorch import Trainer
 
-from nsvq_lightning.data.scene import Scene, View, detailed_pixels
+from nsvq_lightning.data.scene import Scene, View, detailed_pixels, spread
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
@@ -35,7 +35,7 @@ def step_seconds(scene: Scene, count: int, device: torch.device | str = "cpu") -
     scene = scene.standard
     splats = grown(scene, count).to(device)
     adam = optim.build_adam(optim.param_groups(splats, {}, optim.LearningRates(), scene.extent))
-    views = [scene.view(index).to(device) for index in scene.some_train(VIEWS)]
+    views = [scene.view(index).to(device) for index in spread(scene.train, VIEWS)]
 
     def train(some: Sequence[View]) -> None:
         for view in some:

@@ -260,9 +260,10 @@ def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -
     Raises:
         SceneError: The folder is not a scene.
     """
-    from nsvq_lightning.compression.viewpoints import spread, square_views
+    from nsvq_lightning.compression.viewpoints import square_views
+    from nsvq_lightning.data.scene import spread
 
     cameras, photos = known_views(path, root, splats.means.detach().cpu().numpy())
     if photos is not None:
-        return [photos.cameras[index] for index in photos.some_train(most)]
+        return list(spread(photos.train_cameras, most))
     return list(spread(list(cameras.values()), most)) or square_views(splats, most)

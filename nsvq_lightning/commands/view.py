@@ -8,7 +8,6 @@ Examples:
 """
 
 import argparse
-import math
 import sys
 import tempfile
 import webbrowser
@@ -16,13 +15,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import add_root, cameras_of, scene_file, trained_scene
+from nsvq_lightning.io.atomic import make_folder_of
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
@@ -63,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
     with _nsvq_file(options) as file:
         cameras = _cameras(options, file)
         if options.output is not None:
-            options.output.parent.mkdir(parents=True, exist_ok=True)
+            make_folder_of(options.output)
             size = write_viewer(options.output, file, cameras, title)
             say(f"{options.output}: {size:,} bytes")
             return 0
@@ -111,6 +110,7 @@ MAX_CAMERAS = 300
 def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     """Cameras of the photos, or guessed ones."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
+    from nsvq_lightning.data.scene import spread
     from nsvq_lightning.io.formats import load
 
     # What a run has recorded are its own, and need no look at the scene.
@@ -118,8 +118,7 @@ def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     splats = None if options.live or is_own else load(file)
     cameras = cameras_of(options.scene, options.root, None if splats is None else splats.means.detach().numpy())
     if cameras:
-        every = math.ceil(len(cameras) / MAX_CAMERAS)
-        return dict(islice(cameras.items(), 0, None, every))
+        return dict(spread(list(cameras.items()), MAX_CAMERAS))
     if options.live:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
     sys.stderr.write("no photos: cameras are guessed from the scene; --data.root names the folder of the photos\n")

@@ -25,13 +25,12 @@ from nsvq_lightning.compression.viewpoints import (
     check_cameras,
     own_scene,
     showing,
-    spread,
     square_views,
 )
 from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.datamodule import SceneDataModule
-from nsvq_lightning.data.scene import Scene
+from nsvq_lightning.data.scene import Scene, spread
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.morton import spatial_order
 from nsvq_lightning.io.nsvq.file import decode, encode
@@ -186,7 +185,7 @@ class Compressor:
     def __post_init__(self) -> None:
         self._splats = self.scene.tensors()
         self._render = partial(render, antialiased=self.scene.antialiased)
-        known = [self.photos.cameras[index] for index in self.photos.train] if self.photos else self.cameras
+        known = self.photos.train_cameras if self.photos else self.cameras
         self._known = tuple(known)
         if not self.cameras:
             self.cameras = known or square_views(self._splats, VIEWS)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from nsvq_lightning.data.images import ImageStore, Picture
 from nsvq_lightning.data.points import in_picture
-from nsvq_lightning.data.scene import Scene
+from nsvq_lightning.data.scene import Scene, spread
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
@@ -48,11 +47,6 @@ def look_at(target: Float64s, eye: Float64s, width: int, height: int, angle: flo
 def pictures(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool = False) -> list[Tensor]:
     """What each camera sees, ``[H, W, 3]`` in [0, 1]."""
     return [render(splats, camera, antialiased=antialiased).image.clamp(0, 1) for camera in cameras]
-
-
-def spread(rows: Any, most: int) -> Any:
-    """At most so many of the rows of a list, an array or a tensor, evenly spread."""
-    return rows[:: max(1, -(-len(rows) // most))]
 
 
 # Largest number of views in which errors are measured.

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import cv2
 import numpy as np
@@ -32,6 +32,11 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 Factor = Literal[1, 2, 4, 8]
+
+
+def spread(rows: Any, most: int) -> Any:
+    """At most so many of the rows of a list, an array or a tensor, evenly spread."""
+    return rows[:: max(1, -(-len(rows) // most))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +115,10 @@ class Scene:
     def __len__(self) -> int:
         return len(self.names)
 
-    def some_train(self, most: int) -> tuple[int, ...]:
-        """Indices of at most this many train views, evenly spaced."""
-        return self.train[:: -(-len(self.train) // most)]
+    @property
+    def train_cameras(self) -> list[Camera]:
+        """Those of the train views."""
+        return [self.cameras[index] for index in self.train]
 
     @cached_property
     def standard(self) -> "Scene":
@@ -414,6 +420,6 @@ def detailed_pixels(scene: Scene) -> float:
     Raises:
         SceneError: An image cannot be decoded.
     """
-    pictures = (scene.images[index] for index in scene.some_train(_SAMPLE))
+    pictures = (scene.images[index] for index in spread(scene.train, _SAMPLE))
     counts = [np.count_nonzero(np.abs(high_pass(*picture, cv2.CV_16S)) > _DETAIL) for picture in pictures]
     return sum(counts) / len(counts)

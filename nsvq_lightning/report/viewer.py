@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from nsvq_lightning.data.points import projected
-from nsvq_lightning.data.scene import Scene
+from nsvq_lightning.data.scene import Scene, spread
 from nsvq_lightning.io.atomic import StrPath, write_text
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.rendering.camera import Camera, camera_of
@@ -31,7 +31,7 @@ REQUEST = "live.request"
 
 def some_cameras(scene: Scene) -> dict[str, Camera]:
     """Cameras of at most 300 photos by name, evenly spaced."""
-    return dict(list(zip(scene.names, scene.cameras, strict=True))[:: -(-len(scene) // 300)])
+    return dict(spread(list(zip(scene.names, scene.cameras, strict=True)), 300))
 
 
 # RGB of the backgrounds that have names.
@@ -123,9 +123,8 @@ def best_view(splats: SplatTensors, cameras: Sequence[Camera]) -> int:
     Where there is detail, there are many splats; what hides behind others counts, too. At most about 50 000 of the
     splats are looked at, evenly spaced.
     """
-    step = -(-len(splats.means) // 50_000) or 1
-    means = splats.means.detach()[::step].double().numpy()
-    weights = splats.opacities.detach()[::step].sigmoid().numpy()
+    means = spread(splats.means.detach(), 50_000).double().numpy()
+    weights = spread(splats.opacities.detach(), 50_000).sigmoid().numpy()
 
     def shown(camera: Camera) -> float:
         column, row, depth = projected(means, camera.to("cpu"))

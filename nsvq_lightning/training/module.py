@@ -247,12 +247,12 @@ class SplatModule(LightningModule):
         if stage != "fit":
             return
         if scene is not None:
-            self.cameras = trained_by([scene.cameras[index] for index in scene.train])
-        if scene is not None and self.frame == Frame():
-            self.frame = scene.frame
-            # Splats that were given came with the coordinates of the files.
-            for tensor, moved in zip(detached(self.splats), self.frame.splats(self.splats), strict=True):
-                tensor.copy_(moved)
+            self.cameras = trained_by(scene.train_cameras)
+            if self.frame == Frame():
+                self.frame = scene.frame
+                # Splats that were given came with the coordinates of the files.
+                for tensor, moved in zip(detached(self.splats), self.frame.splats(self.splats), strict=True):
+                    tensor.copy_(moved)
         distributed.check_strategy(self.trainer.strategy)
         check_threads()
         if not self.extent:

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from nsvq_lightning.data.dense_start import dense_points
-from nsvq_lightning.data.scene import ONE_PLACE, Scene, View
+from nsvq_lightning.data.scene import ONE_PLACE, Scene, View, spread
 from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.frame import EXTENT, Frame
@@ -57,7 +57,7 @@ def train_contributions(trainer: Trainer, trained: SplatScene) -> Tensor:
     """
     need = "contributions of splats need the train views"
     scene = needed_scene(trainer, need, "leave weights by contribution off")
-    cameras = (scene.cameras[index] for index in scene.train[trainer.global_rank :: trainer.world_size])
+    cameras = scene.train_cameras[trainer.global_rank :: trainer.world_size]
     return sum_over_processes(trainer, contributions(trained.splats, cameras, trained.render))
 
 
@@ -80,7 +80,7 @@ def train_sensitivities(
     """
     need = "what shows of splats is seen in the train views"
     scene = needed_scene(trainer, need, "leave out the callbacks that ask (selection, rate_distortion)")
-    for index in scene.some_train(most)[trainer.global_rank :: trainer.world_size]:
+    for index in spread(scene.train, most)[trainer.global_rank :: trainer.world_size]:
         view = scene.view(index).to(splats.means.device)
         signs = generator(seed, trainer.global_step, "signs", index)
         yield view, *sensitivity(splats, view.camera, trained.render, signs, view.mask)
@@ -130,7 +130,7 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
         return Splats.from_points(scene.points, scene.colors, sh_degree)
     points, colors = _with_dense_points(scene, count - len(scene.points), seed)
     splats = Splats.from_points(points, colors, sh_degree, FIRST_OPACITY)
-    cameras = [scene.cameras[index] for index in scene.train]
+    cameras = scene.train_cameras
     distances, _ = cKDTree([camera.packed_view[12:] for camera in cameras]).query(splats.means.detach())
     pixel = torch.from_numpy(distances).float() / max(camera.intrinsics[0] for camera in cameras)
     splats.scales.data.clamp_(max=(MAX_PIXELS * pixel).log()[:, None])

@@ -19,7 +19,7 @@ from nsvq_lightning.callbacks.forecast import (
     step_seconds,
 )
 from nsvq_lightning.callbacks.growth import splats_for_photos
-from nsvq_lightning.data.scene import Scene, detailed_pixels, load_scene
+from nsvq_lightning.data.scene import Scene, detailed_pixels, load_scene, spread
 from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training.schedule import Schedule
 
@@ -67,7 +67,7 @@ def test_points_are_not_thinned_to_time_fewer(scene: Scene) -> None:
 
 
 def test_a_step_is_timed_on_views_of_the_scene(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = iter([10.0, 10.0 + 0.25 * len(scene.some_train(forecast.VIEWS))])
+    clock = iter([10.0, 10.0 + 0.25 * len(spread(scene.train, forecast.VIEWS))])
     monkeypatch.setattr(forecast.time, "perf_counter", lambda: next(clock))
     assert step_seconds(scene, 600) == pytest.approx(0.25)
     assert next(clock, None) is None  # compiling kernels, in the first view, does not count

@@ -25,7 +25,7 @@ def selected(raw: RawSplats, selection: SplatSelection, budget: int | None = Non
     splats = Splats.from_tensors(*raw)
     photos = [torch.zeros(camera.height, camera.width, 3) for camera in CAMERAS]
     views = [View(str(k), k, camera, photo) for k, (camera, photo) in enumerate(zip(CAMERAS, photos, strict=True))]
-    scene = SimpleNamespace(some_train=lambda most: range(len(views)), view=views.__getitem__)
+    scene = SimpleNamespace(train=range(len(views)), view=views.__getitem__)
     trained = SimpleNamespace(splats=splats, render=render)
     module: Any = SimpleNamespace(splats=splats, schedule=SCHEDULE, seed=0, splat_budget=budget, scene=trained)
     trainer: Any = SimpleNamespace(

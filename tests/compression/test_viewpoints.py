@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nsvq_lightning.compression.viewpoints import Measure, likely_cameras, own_scene, showing, spread
+from nsvq_lightning.compression.viewpoints import Measure, likely_cameras, own_scene, showing
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import RawSplats
@@ -98,9 +98,3 @@ def test_cameras_of_a_part_are_those_that_show_it() -> None:
     assert len(showing(cameras, means, 4)) == 4
     assert len(showing(cameras, means + 1000, 6)) < 3 < len(showing(cameras, means, 6))
     assert showing([], means, 4) == []
-
-
-def test_some_rows_are_spread_over_all() -> None:
-    assert spread(range(10), 4) == range(0, 10, 3)
-    assert spread((), 4) == ()
-    assert spread([1, 2], 4) == [1, 2]

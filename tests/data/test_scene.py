@@ -23,7 +23,7 @@ from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_model
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.images import ImageHead
 from nsvq_lightning.data.reconstruct import reconstruct
-from nsvq_lightning.data.scene import load_scene, usable
+from nsvq_lightning.data.scene import load_scene, spread, usable
 from nsvq_lightning.training.module import SplatModule
 
 SceneFactory = Callable[..., Path]
@@ -511,3 +511,9 @@ def test_photos_are_turned_where_their_cameras_are(
         shown = np.asarray(PIL.ImageOps.exif_transpose(stored)).astype(int)
     assert np.abs(scene.view(0).image.numpy() - shown).max() < 25
     assert load_scene(make_scene("stored", views=2)).images.sources[0].orientation == 1
+
+
+def test_some_rows_are_spread_over_all() -> None:
+    assert spread(range(10), 4) == range(0, 10, 3)
+    assert spread((), 4) == ()
+    assert spread([1, 2], 4) == [1, 2]

@@ -1,6 +1,5 @@
 """Suite ``quantize``: the search for the nearest code, of the rows that a training view sees."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from nsvq_lightning.commands.benchmark.timing import Measurement, Scope, compare
 from nsvq_lightning.commands.benchmark.workloads import workloads
+from nsvq_lightning.data.scene import spread
 from nsvq_lightning.quantize import NSVQ, nearest, nearest_reference
 from nsvq_lightning.quantize.attributes import attribute_rows, build_quantizers
 from nsvq_lightning.quantize.codebook import Quantizer, as_quantizer
@@ -58,8 +58,7 @@ def code_errors(x: Tensor, codebook: Tensor, codes: Tensor) -> dict[str, float]:
         codebook: ``[K, D]``.
         codes: What was found for them.
     """
-    every = math.ceil(len(x) / CHECKED_ROWS)
-    x, codebook, codes = x[::every].double(), codebook.double(), codes[::every]
+    x, codebook, codes = spread(x, CHECKED_ROWS).double(), codebook.double(), spread(codes, CHECKED_ROWS)
     least = (x - codebook[nearest_reference(x, codebook)]).norm(dim=1)
     distance = (x - codebook[codes]).norm(dim=1)
     added = float((distance - least).clamp_min(0).sum())
