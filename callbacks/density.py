@@ -13,12 +13,11 @@ from torch import Tensor
 
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.data.scene import View
-from nsvq_lightning.random import generator
+from nsvq_lightning.random import generator, top_rows
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.splats import RawSplats, detached
 from nsvq_lightning.training import distributed, row_ops, run_scene
-from nsvq_lightning.training.importance import most_contributing
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -79,7 +78,7 @@ class Densification(SplatCallback, ABC):
         if count > limit and module.phase > Phase.PRUNE:
             log.warning(f"{self.limit_name}={limit} comes too late for {count} splats with codebooks; all are kept")
         elif count > limit:
-            kept = most_contributing(run_scene.train_contributions(trainer, module.scene), limit)
+            kept = top_rows(run_scene.train_contributions(trainer, module.scene), limit)
             row_ops.keep_rows(module.splats, trainer.optimizers[0], kept)
             distributed.check_replicas(trainer, "the limit of splats")
             log.info("kept %d of %d splats, those that contribute most to the train views", limit, count)
@@ -275,7 +274,7 @@ class DensityControl(Densification):
         grown = statistic >= self.grad_threshold
         if self.max_splats is not None:
             ranks = torch.where(grown, statistic, -torch.inf)
-            grown &= most_contributing(ranks, max(0, self.max_splats - len(splats)))
+            grown &= top_rows(ranks, max(0, self.max_splats - len(splats)))
         chosen = grown & ~large, grown & large
         clones, parents = (RawSplats(*(tensor[mask] for tensor in detached(splats))) for mask in chosen)
         children = split(parents, self.shrink, generator(module.seed, iteration, "split"))

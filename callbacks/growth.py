@@ -14,13 +14,12 @@ from torch import Tensor
 from nsvq_lightning.data.images import edges_of
 from nsvq_lightning.data.scene import View, detailed_pixels
 from nsvq_lightning.io.nsvq.precision import Precision
-from nsvq_lightning.random import draw_rows, generator
+from nsvq_lightning.random import draw_rows, generator, top_rows
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, codebook_bits
 from nsvq_lightning.splats.splats import RawSplats, detached
 from nsvq_lightning.training import distributed, run_scene
-from nsvq_lightning.training.importance import most_contributing
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
@@ -257,7 +256,7 @@ class BudgetedGrowth(Densification):
             reset_opacities(trainer, module, self.reset_opacity)
         if iteration in (reset + schedule.interval(self.recovery) for reset in resets[: self.recoveries]):
             transparency = -module.splats.opacities
-            self.prune(trainer, module, most_contributing(transparency, int(self.recovery_share * len(transparency))))
+            self.prune(trainer, module, top_rows(transparency, int(self.recovery_share * len(transparency))))
 
     def _split_and_prune(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Split, prune unless it is the last time, and end the phase where splitting has become idle."""

@@ -7,8 +7,9 @@ import torch
 from lightning.pytorch import Trainer
 
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.random import top_rows
 from nsvq_lightning.training import distributed, row_ops, run_scene
-from nsvq_lightning.training.importance import below_cap, likely_effects, most_contributing
+from nsvq_lightning.training.importance import below_cap, likely_effects
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
@@ -86,6 +87,6 @@ class SplatSelection(SplatCallback):
         views = run_scene.train_sensitivities(trainer, module.scene, module.seed, splats, VIEWS)
         squares = sum((found.opacities for _, found, _ in views), torch.zeros_like(splats.opacities))
         effects = likely_effects(splats, distributed.sum_over_processes(trainer, squares))
-        row_ops.keep_rows(module.splats, trainer.optimizers[0], most_contributing(effects, budget))
+        row_ops.keep_rows(module.splats, trainer.optimizers[0], top_rows(effects, budget))
         distributed.check_replicas(trainer, "the selection")
         log.info("iteration %d: the selection leaves %d of %d splats", iteration, budget, count)

@@ -39,7 +39,16 @@ def draw_rows(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
     uniform = torch.rand(weight.shape[0], generator=generator, dtype=torch.float64)
     tiny = torch.finfo(torch.float64).tiny
     key = weight.detach().cpu().double().log() - (-uniform.clamp_min(tiny).log()).clamp_min(tiny).log()
-    chosen = torch.zeros(weight.shape[0], dtype=torch.bool)
-    count = min(max(count, 0), int((weight > 0).sum()))
-    chosen[key.argsort(descending=True, stable=True)[:count]] = True
-    return chosen.to(weight.device)
+    return top_rows(key, min(max(count, 0), int((weight > 0).sum()))).to(weight.device)
+
+
+def top_rows(values: Tensor, count: int) -> Tensor:
+    """Mask ``[N]`` of the ``count`` rows with the largest values; ties go to the first.
+
+    Args:
+        values: Values ``[N]``.
+        count: Number of rows, not negative; all if there are no more.
+    """
+    mask = torch.zeros_like(values, dtype=torch.bool)
+    mask[values.argsort(descending=True, stable=True)[:count]] = True
+    return mask

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from nsvq_lightning.random import draw_rows, generator
+from nsvq_lightning.random import draw_rows, generator, top_rows
 
 
 def test_rows_are_drawn_without_replacement_in_proportion_to_their_weight() -> None:
@@ -33,3 +33,10 @@ def test_a_draw_takes_no_row_of_weight_zero_and_repeats() -> None:
     many = torch.rand(1000, generator=generator(2))
     assert torch.equal(draw_rows(many, 100, generator(7)), draw_rows(many, 100, generator(7)))
     assert not torch.equal(draw_rows(many, 100, generator(7)), draw_rows(many, 100, generator(8)))
+
+
+def test_the_top_rows_are_kept_and_of_equals_the_first() -> None:
+    values = torch.tensor([0.0, 3.0, 1.0, 3.0, 1.0, 2.0])
+    assert top_rows(values, 2).nonzero()[:, 0].tolist() == [1, 3]
+    assert top_rows(values, 4).nonzero()[:, 0].tolist() == [1, 2, 3, 5]
+    assert top_rows(values, 6).all()

@@ -194,13 +194,14 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
 def _thinned(scene: CompressedScene, count: int, options: argparse.Namespace) -> CompressedScene:
     """The splats that contribute most to photos of --data.root, or to the scene's own pictures."""
     from nsvq_lightning.compression.viewpoints import VIEWS
+    from nsvq_lightning.random import top_rows
     from nsvq_lightning.rendering.rasterize import render
-    from nsvq_lightning.training.importance import contributions, most_contributing, row_weights
+    from nsvq_lightning.training.importance import contributions, row_weights
 
     splats = scene.tensors()
     cameras = views_of(options.inputs[0], splats, VIEWS, options.root)
     found = contributions(splats, cameras, partial(render, antialiased=scene.antialiased))
-    return scene.take(most_contributing(row_weights(found), count).numpy())
+    return scene.take(top_rows(row_weights(found), count).numpy())
 
 
 def _measure(source: Path, output: Path, root: Path | None) -> None:

@@ -48,18 +48,6 @@ def contributions(splats: SplatTensors, cameras: Iterable[Camera], render: Rende
     return total
 
 
-def most_contributing(contribution: Tensor, count: int) -> Tensor:
-    """Mask ``[N]`` of the ``count`` splats that contribute most, or have most of anything else; ties go to the first.
-
-    Args:
-        contribution: Contribution ``[N]``.
-        count: Number of splats, not negative; all if there are no more.
-    """
-    mask = torch.zeros_like(contribution, dtype=torch.bool)
-    mask[contribution.argsort(descending=True, stable=True)[:count]] = True
-    return mask
-
-
 def row_weights(contribution: Tensor, least: float = 0.01) -> Tensor:
     """Weights ``[N]`` of splats with ``contribution [N]``: never 0, as test views may see what no photo saw.
 

@@ -21,7 +21,6 @@ from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 from nsvq_lightning.training.importance import (
     contributions,
     floaters,
-    most_contributing,
     row_weights,
     sensitivity,
 )
@@ -62,13 +61,6 @@ def test_all_contributions_make_the_alpha_of_the_picture() -> None:
 def test_weights_are_never_zero() -> None:
     torch.testing.assert_close(row_weights(torch.tensor([0.0, 200.0])), torch.tensor([1.0, 201.0]))
     assert (row_weights(torch.zeros(3)) > 0).all()
-
-
-def test_the_most_contributing_are_kept_and_of_equals_the_first() -> None:
-    contribution = torch.tensor([0.0, 3.0, 1.0, 3.0, 1.0, 2.0])
-    assert most_contributing(contribution, 2).nonzero()[:, 0].tolist() == [1, 3]
-    assert most_contributing(contribution, 4).nonzero()[:, 0].tolist() == [1, 2, 3, 5]
-    assert most_contributing(contribution, 6).all()
 
 
 INTRINSICS = torch.tensor([[12.0, 0.0, 6.0], [0.0, 12.0, 5.0], [0.0, 0.0, 1.0]])
