@@ -276,7 +276,7 @@ class DensityControl(Densification):
             ranks = torch.where(grown, statistic, -torch.inf)
             grown &= top_rows(ranks, max(0, self.max_splats - len(splats)))
         chosen = grown & ~large, grown & large
-        clones, parents = (RawSplats(*(tensor[mask] for tensor in detached(splats))) for mask in chosen)
+        clones, parents = (detached(splats).take(mask) for mask in chosen)
         children = split(parents, self.shrink, generator(module.seed, iteration, "split"))
         new = RawSplats(*map(torch.cat, zip(clones, children, strict=True)))
         return self.divide(trainer, module, grown & large, new)

@@ -11,7 +11,7 @@ from nsvq_lightning.data.scene import Scene, View, detailed_pixels, spread
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.splats.splats import RawSplats, Splats, detached
+from nsvq_lightning.splats.splats import Splats, detached
 from nsvq_lightning.training import optim, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Schedule
@@ -63,7 +63,7 @@ def grown(scene: Scene, count: int) -> Splats:
     points = len(start.means)
     copies = math.ceil(count / points)
     rows = torch.arange(points).repeat(copies)[: max(count, points)]
-    copied = RawSplats(*(values[rows] for values in start))
+    copied = start.take(rows)
     draw = generator(0, 0, "forecast")
     # More splats cover the surfaces with smaller ones, and trained ones overlap in many layers. With these two numbers,
     # renders of fox, bonsai and photos of two megapixels take about as long as those of the trained scenes.

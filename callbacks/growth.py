@@ -289,7 +289,7 @@ class BudgetedGrowth(Densification):
         progress = min(max((reference - self.start) / (self.full - self.start), 0.0), 1.0)
         room = int(self.limit(module) * math.sqrt(progress)) - len(splats)
         divided = draw_rows(candidates, room, generator(module.seed, iteration, "grow"))
-        parents = RawSplats(*(tensor[divided] for tensor in detached(splats)))
+        parents = detached(splats).take(divided)
         return room, self.divide(trainer, module, divided, split_longest(parents))
 
 

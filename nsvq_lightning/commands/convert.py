@@ -181,7 +181,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
         return (photos.view(index) for index in tqdm(photos.train, unit=" photos", mininterval=1))
 
     def psnr(keep: torch.Tensor) -> float:
-        kept = type(splats)(*(tensor[keep] for tensor in splats))
+        kept = splats.take(keep)
         return evaluate(look, kept, map(photos.view, photos.test))[0]
 
     removed = floaters(splats, views, look)

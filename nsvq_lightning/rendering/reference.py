@@ -13,7 +13,6 @@ from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.sampling import ViewSampling
 from nsvq_lightning.rendering.sh import sh_colors
-from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors
 
@@ -133,7 +132,7 @@ def visible(splats: SplatTensors, camera: Camera, sampling: ViewSampling | None 
 
 
 def render(
-    splats: SplatTensors,
+    splats: RawSplats,
     camera: Camera,
     sh_degree: int,
     background: Tensor,
@@ -146,7 +145,7 @@ def render(
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.
     """
     rows = visible(splats, camera, sampling)
-    shown = RawSplats(*(getattr(splats, name)[rows] for name in ATTRIBUTES))
+    shown = splats.take(rows)
     projection = project(shown, camera, None if sampling is None else sampling.of(rows))
     n = splats.means.shape[0]
     means2d = splats.means.new_zeros(n, 2).index_copy(0, rows, projection.means2d)

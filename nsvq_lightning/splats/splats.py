@@ -31,6 +31,10 @@ class RawSplats(NamedTuple):
     sh0: Tensor
     shN: Tensor
 
+    def take(self, rows: Tensor) -> "RawSplats":
+        """Some of the splats, by index or mask."""
+        return RawSplats(*(tensor[rows] for tensor in self))
+
 
 def sh_degree_of(shN: Tensor) -> int:
     """Degree of the spherical harmonics whose higher coefficients are ``shN [N, (degree + 1)² - 1, 3]``.

@@ -142,7 +142,7 @@ def floaters(splats: SplatTensors, views: Callable[[], Iterable[View]], render: 
     mask = torch.ones_like(left, dtype=torch.bool)
     threshold = torch.inf
     for number in range(12):
-        rest = RawSplats(*(tensor[left] for tensor in raw))
+        rest = raw.take(left)
         slope, curvature, error = removal_effects(rest, views(), render, generator(0, number, "floaters"))
         # Of a floater's opacity, the photos want at most a third; 0 of one in front of a finished scene.
         gain = torch.where(slope < 2 * (1 / 3 - 1) * curvature, -slope - curvature, 0)
