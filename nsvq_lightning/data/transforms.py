@@ -20,6 +20,7 @@ from nsvq_lightning.data.images import image_head
 from nsvq_lightning.data.photo_files import locate
 from nsvq_lightning.data.points import cloud_in, read_points, share_seen
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.poses import viewmat_of
 from nsvq_lightning.splats.conventions import Float64s, Uint8s
 
 log = logging.getLogger(__name__)
@@ -212,10 +213,7 @@ class _Frame:
         rotation = left @ right
         if np.abs(rotation - axes).max() > 1e-3 or np.linalg.det(rotation) < 0:
             raise self.error("has a transform_matrix that is no rotation: its axes are skewed or mirrored")
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = (rotation * (1, -1, -1)).T
-        viewmat[:3, 3] = -viewmat[:3, :3] @ matrix[:3, 3]
-        return viewmat
+        return viewmat_of((rotation * (1, -1, -1)).T, matrix[:3, 3])
 
 
 def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> ColmapModel:

@@ -13,6 +13,7 @@ import torch
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
+from nsvq_lightning.rendering.poses import viewmat_of
 from nsvq_lightning.rendering.sampling import Sampling
 from nsvq_lightning.splats.conventions import Float32s, Float64s
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
@@ -68,9 +69,7 @@ class Frame:
         known = _cameras.setdefault(camera, {})
         if self not in known:
             packed = np.array(camera.packed_view)
-            view = np.eye(4)
-            view[:3, :3] = packed[:9].reshape(3, 3)
-            view[:3, 3] = -view[:3, :3] @ self.points(packed[None, 12:])[0]
+            view = viewmat_of(packed[:9].reshape(3, 3), self.points(packed[None, 12:])[0])
             near = float(f"{camera.near / self.unit:.6g}")
             moved = Camera(camera.K.double(), torch.from_numpy(view), camera.width, camera.height, near)
             known[self] = moved.to(dtype=torch.float32)

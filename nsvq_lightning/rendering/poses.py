@@ -62,7 +62,12 @@ def view_towards(target: Float64s, eye: Float64s, up: Float64s) -> Tensor:
 
 def view_from(rotation: Float64s, position: Float64s) -> Tensor:
     """World to camera ``[4, 4]`` float32, from the rotation to the world and the position in it."""
+    return torch.from_numpy(viewmat_of(rotation.T, position).astype(np.float32))
+
+
+def viewmat_of(rotation: Float64s, position: Float64s) -> Float64s:
+    """World to camera ``[4, 4]``, from the rotation to the camera and the position in the world."""
     view = np.eye(4)
-    view[:3, :3] = rotation.T
-    view[:3, 3] = -rotation.T @ position
-    return torch.from_numpy(view.astype(np.float32))
+    view[:3, :3] = rotation
+    view[:3, 3] = -view[:3, :3] @ position
+    return view
