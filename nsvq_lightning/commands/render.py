@@ -99,7 +99,7 @@ def run(options: argparse.Namespace) -> int:
         sampling=scene.sampling(),
         backend=options.backend,
     )
-    width, height = cameras[0].width, cameras[0].height
+    width, height = cameras[0].size
     with torch.no_grad(), frame_writer(output, width, height, fps) as write:
         for camera in tqdm(cameras, unit=" frames", mininterval=1):
             write(look(raw, camera).image)
@@ -126,7 +126,7 @@ def _path(options: argparse.Namespace, splats: "Splats", is_video: bool) -> "tup
             raise ValueError(f"--path {kind} needs cameras of photos: name their folder (--data.root), or take orbit")
         log.info("no photos: their cameras are guessed from the scene; --data.root names the folder of the photos")
         cameras = likely_cameras(splats, 24)
-    width, height = options.size or (cameras[0].width, cameras[0].height)
+    width, height = options.size or cameras[0].size
     if is_video and (width % 2 or height % 2):
         width, height = max(2, width - width % 2), max(2, height - height % 2)
         log.info("videos have even sides: %dx%d", width, height)

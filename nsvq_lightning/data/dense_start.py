@@ -118,7 +118,7 @@ MAX_SIDE = 800
 def _photo(scene: Scene, index: int, known: Float64s) -> _Photo:
     camera = scene.cameras[index]
     image, mask = scene.images[index]
-    scale = min(1.0, MAX_SIDE / max(camera.width, camera.height))
+    scale = min(1.0, MAX_SIDE / max(camera.size))
     width = round(camera.width * scale)
     height = round(camera.height * scale)
     pixels, counts = resized(image.numpy(), None if mask is None else mask.numpy(), (width, height))

@@ -95,7 +95,7 @@ def random_points(cameras: list[Camera]) -> Float64s:
     chosen = torch.randint(len(cameras), (count,), generator=draws).numpy()
     across, down, away = torch.rand(3, count, generator=draws, dtype=torch.float64).numpy()
     fx, fy, cx, cy = np.array([camera.intrinsics for camera in cameras])[chosen].T
-    width, height = np.array([(camera.width, camera.height) for camera in cameras])[chosen].T
+    width, height = np.array([camera.size for camera in cameras])[chosen].T
     x = (across * width - cx) / fx
     y = (down * height - cy) / fy
     rays = np.c_[x, y, np.ones(count)]

@@ -45,14 +45,19 @@ class Camera:
             raise ValueError(f"Camera needs at least one pixel, got {self.width}x{self.height}")
         fx, fy = float(self.K[0, 0]), float(self.K[1, 1])
         # Kept as Python floats: reading them from an accelerator would stall it at every render.
-        object.__setattr__(self, "intrinsics", (fx, fy, float(self.K[0, 2]), float(self.K[1, 2])))
-        object.__setattr__(self, "packed_view", _packed(self.viewmat))
+        intrinsics = fx, fy, float(self.K[0, 2]), float(self.K[1, 2])
+        vars(self).update(intrinsics=intrinsics, packed_view=_packed(self.viewmat))
         if not (0 < fx < math.inf and 0 < fy < math.inf):
             raise ValueError(f"Camera.K needs positive, finite focal lengths, got fx={fx}, fy={fy}")
         if not 0 < self.near < math.inf:
             raise ValueError(f"Camera.near must be positive and finite, got {self.near}")
         if self.K[0, 1] != 0:
             raise ValueError(f"Camera.K must be without skew, got {float(self.K[0, 1])}: no back-end renders it")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.width, self.height
 
     @property
     def slope_limits(self) -> tuple[float, float, float, float]:

@@ -43,8 +43,7 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """
     if not cameras or frames < 1:
         raise ValueError(f"a path needs at least one camera and one frame, got {len(cameras)} and {frames}")
-    width, height = cameras[0].width, cameras[0].height
-    if any((camera.width, camera.height) != (width, height) for camera in cameras):
+    if len({camera.size for camera in cameras}) > 1:
         raise ValueError("cameras of a path must have one size; reframe them first")
     positions, rotations = poses(cameras)
     unit = float(np.median(np.linalg.norm(positions - positions.mean(0), axis=1))) or 1.0
@@ -63,7 +62,7 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     lenses = np.stack([np.interp(times, at, column) for column in intrinsics.T], axis=1)
     matrices = turn(times).as_matrix()
     return [
-        camera_of(view_from(matrix, position), tuple(lens), width, height, cameras[0].near)
+        camera_of(view_from(matrix, position), tuple(lens), *cameras[0].size, cameras[0].near)
         for matrix, position, lens in zip(matrices, place(times), lenses, strict=True)
     ]
 
@@ -107,7 +106,7 @@ def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     path = []
     for angle in start + turns:
         eye = middle + height * up + radius * (math.cos(angle) * across + math.sin(angle) * ahead)
-        path.append(camera_of(view_towards(middle, eye, up), lens, first.width, first.height, first.near))
+        path.append(camera_of(view_towards(middle, eye, up), lens, *first.size, first.near))
     return path
 
 

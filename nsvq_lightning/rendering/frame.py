@@ -60,7 +60,7 @@ class Frame:
 
     def points(self, points: Float64s) -> Float64s:
         """Points ``[P, 3]`` of the files, here; rounded."""
-        return np.asarray(np.rint((points - self.middle) / self.unit * STEPS) / STEPS)
+        return np.rint((points - self.middle) / self.unit * STEPS) / STEPS
 
     def camera(self, camera: Camera) -> Camera:
         """A camera of the files, here."""
@@ -71,7 +71,7 @@ class Frame:
             packed = np.array(camera.packed_view)
             view = viewmat_of(packed[:9].reshape(3, 3), self.points(packed[None, 12:])[0])
             near = float(f"{camera.near / self.unit:.6g}")
-            moved = Camera(camera.K.double(), torch.from_numpy(view), camera.width, camera.height, near)
+            moved = Camera(camera.K.double(), torch.from_numpy(view), *camera.size, near)
             known[self] = moved.to(dtype=torch.float32)
         return known[self]
 

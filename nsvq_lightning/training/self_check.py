@@ -15,7 +15,7 @@ from nsvq_lightning.quantize.kmeans import lookup
 from nsvq_lightning.quantize.nearest import nearest, nearest_reference
 from nsvq_lightning.quantize.nsvq import noise_substitution
 from nsvq_lightning.random import generator
-from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.camera import camera_of
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.attributes import attribute_shapes
 from nsvq_lightning.splats.splats import RawSplats
@@ -58,8 +58,8 @@ def _step(backend: str, device: str, dtype: torch.dtype) -> dict[str, Tensor]:
     made["scales"] -= 2.5
     photo, codebook = torch.rand(72, 96, 3, generator=draw), torch.randn(100, 4, generator=draw).to(device, dtype)
     splats = RawSplats(**{name: value.to(device, dtype).requires_grad_() for name, value in made.items()})
-    focal, view = torch.tensor([[80.0, 0, 48], [0, 80, 36], [0, 0, 1]]), torch.eye(4)
-    image = render(splats, Camera(focal, view, 96, 72), backend=backend).image
+    camera = camera_of(torch.eye(4), (80, 80, 48, 36), 96, 72)
+    image = render(splats, camera, backend=backend).image
     loss = photometric_loss(image, photo.to(device, dtype))
     loss.backward()  # type: ignore[no-untyped-call]
     quats, codebook = splats.quats.detach(), codebook.requires_grad_()

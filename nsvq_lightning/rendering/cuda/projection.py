@@ -182,7 +182,7 @@ class Lens(NamedTuple):
         if lens is None:
             numbers = [*camera.packed_view, *camera.slope_limits, camera.near]
             view = to_device(torch.tensor(numbers, dtype=torch.float32), device)
-            lens = cls(view, *camera.intrinsics, camera.width, camera.height)
+            lens = cls(view, *camera.intrinsics, *camera.size)
             _lenses.setdefault(camera, {})[device] = lens
         return lens
 
