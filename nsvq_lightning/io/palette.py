@@ -169,8 +169,8 @@ def scalar_kmeans(values: Float32s, weight: Integers | int = 1, count: int = 256
     _, cells = find_palette(numbers.astype(np.float32)[:, None], mass, count)
     starts = np.flatnonzero(np.diff(cells, prepend=-1))
     middle = float(np.average(numbers, weights=mass))  # sums of differences from it lose no digits
-    mass = np.concatenate([[0.0], mass.cumsum()])
-    sums = np.concatenate([[0.0], (np.diff(mass) * (numbers - middle)).cumsum()])
+    mass = np.r_[0.0, mass.cumsum()]
+    sums = np.r_[0.0, (np.diff(mass) * (numbers - middle)).cumsum()]
 
     def means(ends: Integers, empty: Float64s) -> Float64s:
         """Means ``[C]`` of the cells between ``ends [C + 1]``; for a cell without values, that of ``empty [C]``."""

@@ -48,16 +48,16 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     positions, rotations = poses(cameras)
     unit = float(np.median(np.linalg.norm(positions - positions.mean(0), axis=1))) or 1.0
     steps = _steps(positions, rotations, unit)
-    kept = np.concatenate([[True], steps > 1e-6])
+    kept = np.r_[True, steps > 1e-6]
     positions, rotations = positions[kept], rotations[kept]
     intrinsics = np.array([camera.intrinsics for camera in cameras])[kept]
     if len(positions) == 1:
         return [cameras[0]] * frames
-    at = np.concatenate([[0.0], np.cumsum(steps[kept[1:]])])
+    at = np.r_[0.0, np.cumsum(steps[kept[1:]])]
     place = CubicSpline(at, positions, bc_type="natural")
     turn = RotationSpline(at, rotations)
     fine = np.linspace(0.0, at[-1], 16 * frames + 1)  # where the speed is measured
-    way = np.concatenate([[0.0], np.cumsum(_steps(place(fine), turn(fine), unit))])
+    way = np.r_[0.0, np.cumsum(_steps(place(fine), turn(fine), unit))]
     times = np.interp(np.linspace(0.0, way[-1], frames), way, fine)
     lenses = np.stack([np.interp(times, at, column) for column in intrinsics.T], axis=1)
     matrices = turn(times).as_matrix()
@@ -227,6 +227,6 @@ def _rigid_view(rotation: Float64s, position: Float64s) -> Tensor:
 def _arc(angles: Float64s) -> tuple[float, float]:
     """Start and length of the arc that angles fill: the circle without their largest gap."""
     ordered = np.sort(angles)
-    gaps = np.diff(np.concatenate([ordered, ordered[:1] + 2 * math.pi]))
+    gaps = np.diff(ordered, append=ordered[:1] + 2 * math.pi)
     widest = int(np.argmax(gaps))
     return float(ordered[(widest + 1) % len(ordered)]), float(2 * math.pi - gaps[widest])

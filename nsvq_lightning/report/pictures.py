@@ -165,13 +165,6 @@ def frame_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
         yield lambda picture: write_png(next(names), picture)
 
 
-def new_figure(width: float, height: float) -> Any:
-    """An empty figure, size in inches; pyplot is not used, as it keeps global state and may look for a display."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
 def write_figure(path: Path, figure: Any) -> None:
     """Write a figure as PNG, cropped to its content, atomically."""
     with atomic_write(path) as file:
@@ -180,7 +173,10 @@ def write_figure(path: Path, figure: Any) -> None:
 
 def curve_figure(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> Any:
     """PSNR and number of splats over the iterations, with phases shaded, as a Matplotlib figure."""
-    figure = new_figure(8, 4)
+    # pyplot is not used, as it keeps global state and may look for a display.
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 4), layout="constrained")  # inches
     quality = figure.add_subplot()
     number = quality.twinx()
     iterations = [entry["iteration"] for entry in history]

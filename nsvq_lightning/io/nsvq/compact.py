@@ -30,6 +30,7 @@ from nsvq_lightning.io.nsvq import entropy, rounding
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 from nsvq_lightning.io.nsvq.precision import MAX_OPACITY_LEVELS, Precision
 from nsvq_lightning.io.nsvq.rounding import leaf_paths
+from nsvq_lightning.io.numbers import logits_of
 from nsvq_lightning.splats.attributes import QUANTIZABLE
 from nsvq_lightning.splats.conventions import Int32s, Int64s, Uint64s
 
@@ -126,7 +127,8 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
             bases[name] = attribute.floats()
         else:
             raw[name] = attribute.floats()
-    opacities = rounding.logits_of_levels(levels.entry.codes)[levels.values]
+    middles = (np.arange(levels.entry.codes) + 0.5) / levels.entry.codes
+    opacities = logits_of(middles)[levels.values]
     return CompressedScene(means, opacities, codes, codebooks, raw, bases=bases, **header.of_scene)
 
 

@@ -141,7 +141,8 @@ def encode_integers(values: Integers, order: Int64s | None = None) -> bytes:
     bits = np.empty((2, values.shape[1]), np.int64)  # approximately those of values, and of their steps
     for column, numbers in enumerate(values.T):
         ordered = numbers[order].astype(np.int64)
-        bits[:, column] = [_bit_lengths(each).sum() for each in (ordered, np.diff(ordered, prepend=0))]
+        steps = np.diff(ordered, prepend=0)
+        bits[:, column] = [np.frexp(np.abs(each))[1].sum() for each in (ordered, steps)]
     by_steps: Bools = bits[1] < bits[0]
     words = _room(int(bits.min(0).sum()) + 8 * values.size)
     contexts = rc.new_contexts(_INTEGER_CONTEXTS * values.shape[1])
@@ -343,11 +344,6 @@ def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
 
 
 # Integers
-
-
-def _bit_lengths(values: Int64s) -> Int64s:
-    """Bit length of each absolute value; 0 for 0."""
-    return np.frexp(np.abs(values).astype(np.float64))[1].astype(np.int64)
 
 
 @_stream_kernel

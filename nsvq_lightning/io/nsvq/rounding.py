@@ -16,7 +16,7 @@ from nsvq_lightning.io.compressed import ROWS, CompressedScene
 from nsvq_lightning.io.morton import Grid
 from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
-from nsvq_lightning.io.numbers import coarsest_power, logits_of, nearest_power, opacity_of
+from nsvq_lightning.io.numbers import coarsest_power, nearest_power, opacity_of
 from nsvq_lightning.io.palette import mean_and_direction
 from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s, Integers, unit
 
@@ -141,14 +141,6 @@ def _integers(name: str, rows: Float32s, step: float, limit: float = 2.0**52) ->
         part = slice(start, start + ROWS)
         integers[part] = np.rint(rows[part].astype(np.float64) / step)
     return integers
-
-
-# Opacities
-
-
-def logits_of_levels(count: int) -> Float32s:
-    """Logit ``[count]`` of the middle of each level."""
-    return logits_of((np.arange(count) + 0.5) / count)
 
 
 # Positions
