@@ -207,9 +207,7 @@ class Compressor:
         """The views to train on."""
         return SceneDataModule(self.photos or own_scene(self._splats, self.cameras, self.scene.antialiased), self.seed)
 
-    def best(
-        self, splats: int, codebooks: str | None = None, target_bytes: int | None = None, max_error: float | None = None
-    ) -> Candidate:
+    def best(self, splats: int, codebooks: str | None, target_bytes: int | None, max_error: float | None) -> Candidate:
         """The smallest file with an error, the best one of a size, or that with these codebooks; the first asked for.
 
         Raises:

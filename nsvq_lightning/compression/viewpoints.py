@@ -192,7 +192,7 @@ PLACES = 48
 
 
 def likely_cameras(
-    splats: SplatTensors, count: int, width: int = 560, height: int = 392, seed: int = 0, degrees: float = 70
+    splats: SplatTensors, count: int, width: int = 560, height: int = 392, degrees: float = 70
 ) -> list[Camera]:
     """Cameras from which a scene shows much detail, as it does where photos were taken, the best one first.
 
@@ -207,7 +207,6 @@ def likely_cameras(
         count: Number of cameras.
         width: Pixels.
         height: Pixels.
-        seed: Seed of the candidates.
         degrees: Horizontal field of view.
     """
     angle = math.radians(degrees)
@@ -219,7 +218,7 @@ def likely_cameras(
     middle = weights @ means
     reach = math.sqrt(weights @ ((means - middle) ** 2).sum(1)) or 1.0
     candidates = 5 * count
-    draws = np.random.default_rng(seed)
+    draws = np.random.default_rng(0)
     directions = draws.standard_normal((candidates, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     away = draws.uniform(*AROUND, (candidates, 1))

@@ -151,7 +151,7 @@ def is_outside(name: str) -> bool:
     return bool(path.anchor) or ".." in path.parts
 
 
-def check_name(name: str, source: object, allow_outside: bool = False) -> None:
+def check_name(name: str, source: object, allow_outside: bool) -> None:
     """Check the name of a file that a model gives relative to its scene folder.
 
     Args:

@@ -51,7 +51,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 _ZIP = b"PK\x03\x04"
 
 
-def sog_contents(scene: CompressedScene, palette: int = PALETTE_LIMIT) -> dict[str, bytes]:
+def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
     """The files of an archive or folder by name, ``meta.json`` first; splats keep their order.
 
     A codebook of the spherical harmonics becomes the palette and its codes the labels, renumbered in order of first

@@ -57,10 +57,8 @@ def test_a_room_is_seen_from_inside(is_room: bool) -> None:
 
 
 def test_the_same_scene_has_the_same_views_and_the_best_come_first() -> None:
-    few, many = (likely_cameras(painting(), 5, 64, 48, seed=seed) for seed in (1, 1))
-    assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(few, many, strict=True))
-    other = likely_cameras(painting(), 5, 64, 48, seed=2)
-    assert not torch.equal(few[0].viewmat, other[0].viewmat)
+    once, again = (likely_cameras(painting(), 5, 64, 48) for _ in range(2))
+    assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(once, again, strict=True))
 
 
 def test_a_single_splat_and_one_above_another_have_views() -> None:

@@ -101,7 +101,6 @@ def compare(
     values: Mapping[str, Mapping[str, float]],
     scope: Scope,
     device: str = "cpu",
-    prepare: Call | None = None,
 ) -> list[Measurement]:
     """Time the methods of an operation in turns, in an order that rotates, and reverses, from round to round.
 
@@ -116,7 +115,6 @@ def compare(
         values: Errors and sizes by method, then by name.
         scope: Number of rounds and time limit.
         device: Where the work is done, and with it the matrix product.
-        prepare: Done before every call of a method, not timed.
     """
     players = [("", sgemm(device)), *cases.items()]
     samples: dict[str, list[float]] = {name: [] for name, _ in players}
@@ -130,8 +128,6 @@ def compare(
             for name, call in order[:: -1 if turn % 2 else 1]:
                 if name and sum(samples[name]) >= 1000 * scope.seconds:
                     continue
-                if name and prepare is not None:
-                    prepare()
                 took = milliseconds(call)
                 if turn >= 0:
                     samples[name].append(took)

@@ -16,9 +16,9 @@ def small_product(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timing, "SGEMM_SIDE", 16)
 
 
-def measure(cases: dict[str, Call], scope: Scope, prepare: Call | None = None) -> dict[str, Measurement]:
+def measure(cases: dict[str, Call], scope: Scope) -> dict[str, Measurement]:
     values: dict[str, dict[str, float]] = {name: {} for name in cases}
-    return {row.method: row for row in compare("search", "W", cases, values, scope, prepare=prepare)}
+    return {row.method: row for row in compare("search", "W", cases, values, scope)}
 
 
 def test_cases_take_turns_in_a_rotating_order_after_one_call_that_is_not_counted() -> None:
@@ -40,9 +40,9 @@ def test_the_work_of_a_gpu_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_slow_case_sits_out_once_its_time_is_used_up() -> None:
     cases: dict[str, Call] = {"slow": lambda: time.sleep(0.03), "fast": lambda: None}
-    timings = measure(cases, Scope(repeats=6, seconds=0.05), prepare=lambda: time.sleep(0.1))
+    timings = measure(cases, Scope(repeats=6, seconds=0.05))
     assert len(timings["slow"].samples) == 2
-    assert 30 <= min(timings["slow"].samples) < 100  # ms, without the preparation
+    assert 30 <= min(timings["slow"].samples) < 100  # ms
     assert len(timings["fast"].samples) == len(timings["fast"].sgemm) == 6
 
 
