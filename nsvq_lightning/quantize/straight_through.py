@@ -69,7 +69,7 @@ class PostHoc(CodebookQuantizer):
         if self.frozen or not self.training:
             return super().forward(x, generator, rows)
         count = len(x) if rows is None else len(rows)
-        codes = torch.full((count,), -1, dtype=torch.int64, device=x.device)
+        codes = x.new_full((count,), -1, dtype=torch.int64)
         return self.approximate(x, codes, generator, rows), codes
 
     def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator | None, rows: Tensor | None) -> Tensor:

@@ -84,7 +84,7 @@ class Frame:
     def splats(self, splats: SplatTensors) -> RawSplats:
         """Splats of the files, here; detached."""
         raw = detached(splats)
-        middle = torch.tensor(self.middle, dtype=torch.float64, device=raw.means.device)
+        middle = raw.means.new_tensor(self.middle, dtype=torch.float64)
         means = ((raw.means.double() - middle) / self.unit).to(raw.means)
         return raw._replace(means=means, scales=(raw.scales.double() - math.log(self.unit)).to(raw.scales))
 

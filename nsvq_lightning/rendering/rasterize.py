@@ -83,7 +83,7 @@ def render(
         raise ValueError(f"sh_degree must be between 0 and the stored degree {stored}, got {sh_degree}")
     means = splats.means
     if background is None:
-        background = torch.zeros(3, dtype=means.dtype, device=means.device)
+        background = means.new_zeros(3)
     elif tuple(background.shape) != (3,):
         raise ValueError(f"background must be one RGB colour of shape [3], got {list(background.shape)}")
     background = background.to(means)

@@ -149,7 +149,7 @@ def render(
     projection = project(shown, camera, None if sampling is None else sampling.of(rows))
     n = splats.means.shape[0]
     means2d = splats.means.new_zeros(n, 2).index_copy(0, rows, projection.means2d)
-    radii = torch.zeros(n, dtype=torch.int32, device=rows.device)
+    radii = rows.new_zeros(n, dtype=torch.int32)
     radii[rows] = projection.half_sizes.amax(-1).ceil().clamp_max(2**30).to(torch.int32)
 
     direction = shown.means - camera.to(shown.means.device, shown.means.dtype).position

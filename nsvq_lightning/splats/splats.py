@@ -171,7 +171,7 @@ class Splats(nn.Module):
         """Add (or get) a side table ``[N]`` of zeros that follows the rows through every edit and checkpoint."""
         if name not in self._tables:
             self._tables.append(name)
-            self.register_buffer(name, torch.zeros(len(self), device=self.means.device))
+            self.register_buffer(name, self.means.new_zeros(len(self)))
         return self.get_buffer(name)
 
     def tables(self) -> dict[str, Tensor]:
@@ -273,7 +273,7 @@ def canonical(scales: Tensor, quats: Tensor) -> Canonical:
     """
     squared = quats.square().sum(1, keepdim=True)
     directed = ~(squared < MIN_SQUARED_NORM)
-    quats = torch.where(directed, quats, torch.eye(4, dtype=quats.dtype, device=quats.device)[0])
+    quats = torch.where(directed, quats, torch.eye(4).to(quats)[0])
     lengths = torch.where(directed, squared, 1.0).sqrt()
     order = scales.argsort(dim=1, descending=True, stable=True)
     # The order fixes a rotation up to half turns around the axes; of these four, the one with the largest w.
@@ -282,7 +282,7 @@ def canonical(scales: Tensor, quats: Tensor) -> Canonical:
     turns = each[number, _apply(each[:, :, 0][number], quats).abs().argmax(1)]
     turned = _apply(turns, quats)
     signs = torch.where(turned[:, :1] < 0, -1.0, 1.0).to(quats)
-    axes = torch.eye(3, dtype=scales.dtype, device=scales.device)
+    axes = torch.eye(3).to(scales)
     quat_maps = (signs * lengths)[:, :, None] * turns
     return Canonical(scales.gather(1, order), signs * turned / lengths, axes[order], quat_maps)
 

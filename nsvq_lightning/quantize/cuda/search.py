@@ -95,7 +95,7 @@ def nearest_codes(x: Tensor, codebook: Tensor) -> Tensor:
     """
     check_tensor("x", x, (len(x), codebook.shape[-1]), x.device)
     check_tensor("codebook", codebook, (len(codebook), x.shape[1]), x.device)
-    result = torch.empty(len(x), dtype=torch.int64, device=x.device)
+    result = x.new_empty(len(x), dtype=torch.int64)
     if len(x):
         codes = by_column(codebook)
         with torch.cuda.device_of(x):
@@ -284,8 +284,8 @@ class DeviceTracker:
         self._snapshot = codebook.clone()
         self._memory = empty_memory(0, codebook.shape[1], codebook.device)
         self._steps = 0
-        self._travelled = torch.zeros(1, dtype=torch.float64, device=codebook.device)
-        self._squared_drift = torch.zeros(1, dtype=torch.int32, device=codebook.device)
+        self._travelled = codebook.new_zeros(1, dtype=torch.float64)
+        self._squared_drift = codebook.new_zeros(1, dtype=torch.int32)
 
     def fits(self, codebook: Tensor) -> bool:
         """Whether it remembers searches of as many codes, on this device."""
@@ -315,7 +315,7 @@ class DeviceTracker:
             self._memory = tuple(map(torch.cat, both))
         if count == 0:
             return result
-        searched, queue = torch.empty(2, count, dtype=torch.int32, device=device)
+        searched, queue = rows.new_empty(2, count, dtype=torch.int32)
         travel, codes = (self._travelled, self._squared_drift), by_column(codebook)
         with torch.cuda.device_of(x):
             self._follow(codebook)

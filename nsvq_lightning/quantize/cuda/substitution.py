@@ -275,8 +275,8 @@ def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) 
     dim = values.shape[1]
     width = min(64, triton.next_power_of_2(dim))
     columns = triton.cdiv(dim, width)
-    partial = torch.empty(num_codes * PARTS.value, dim, dtype=dtype, device=values.device)
-    sums = torch.empty(num_codes, dim, dtype=dtype, device=values.device)
+    partial = values.new_empty(num_codes * PARTS.value, dim, dtype=dtype)
+    sums = values.new_empty(num_codes, dim, dtype=dtype)
     with torch.cuda.device_of(values):
         part_kernel[(num_codes * PARTS.value, columns)](
             values, order, offsets, partial, dim, WIDTH=width, num_warps=1, **COMPILE

@@ -87,7 +87,7 @@ def tiles_of(boxes: Tensor, ends: Tensor, total: int, columns: int, rows: int) -
     device, tiles = boxes.device, columns * rows
     # 16-bit keys take a quarter of the sorting passes of 64-bit ones.
     key = torch.int16 if tiles < 2**15 else torch.int32
-    keys, owners = torch.empty(total, dtype=key, device=device), torch.empty(total, dtype=torch.int32, device=device)
+    keys, owners = (boxes.new_empty(total, dtype=kind) for kind in (key, torch.int32))
     if total:
         block = 512  # pairs per program
         expand_kernel[(triton.cdiv(total, block),)](

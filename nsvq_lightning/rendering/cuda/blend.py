@@ -232,7 +232,7 @@ def blend(lens: Lens, records: Tensor, tiles: Tiles, background: Tensor) -> tupl
     check_tensor("background", background, (3,), records.device)
     image = records.new_empty(lens.height, lens.width, 3)
     transmittance, depth = (records.new_empty(lens.height, lens.width) for _ in range(2))
-    ends = torch.empty(columns * rows, dtype=torch.int32, device=records.device)
+    ends = records.new_empty(columns * rows, dtype=torch.int32)
     # With one warp a tile, every reduction stays inside it; after each batch, whether the tile is finished is checked.
     blend_kernel[(columns * rows,)](
         records, tiles.ranks, tiles.offsets, tiles.order, ends, background, image, transmittance, depth,

@@ -230,7 +230,7 @@ def _launch_projection(
 ) -> Tensor:
     n, shN = attributes[0].shape[0], attributes[-1]
     _check_attributes(lens, attributes, sampling)
-    radii = torch.zeros(n, dtype=torch.int32, device=shN.device)
+    radii = shN.new_zeros(n, dtype=torch.int32)
     if n:
         project_kernel[(triton.cdiv(n, BLOCK),)](
             *attributes, *lens, n, 3 * shN.shape[1], *(sampling or NO_SAMPLING), records, boxes, means2d, radii,
@@ -266,7 +266,7 @@ def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int, sampling: V
     means = attributes[0]
     n = means.shape[0]
     records = means.new_empty(n, rec.RECORD.value)
-    boxes = torch.empty(n, 4, dtype=torch.int32, device=means.device)
+    boxes = means.new_empty(n, 4, dtype=torch.int32)
     means2d = means.new_zeros(n, 2)
     radii = _launch_projection(lens, attributes, degree, sampling, records, boxes, means2d)
     ids = radii.nonzero()[:, 0]
@@ -309,7 +309,7 @@ def project_backward(
     gradients = [torch.empty_like(attribute) for attribute in attributes]
     means, quats, scales, logits, _, shN = attributes
     n = means.shape[0]
-    ranks = torch.full((n,), -1, dtype=torch.int32, device=device)
+    ranks = means.new_full((n,), -1, dtype=torch.int32)
     ranks[ids] = torch.arange(len(ids), dtype=torch.int32, device=device)
     if n:
         project_backward_kernel[(triton.cdiv(n, BLOCK),)](
