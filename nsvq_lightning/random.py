@@ -36,7 +36,7 @@ def draw_rows(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
         count: How many to draw.
         generator: Source of the draws, on the CPU.
     """
-    uniform = torch.rand(weight.shape[0], generator=generator, dtype=torch.float64)
+    uniform = torch.rand(len(weight), generator=generator, dtype=torch.float64)
     tiny = torch.finfo(torch.float64).tiny
     key = weight.detach().cpu().double().log() - (-uniform.clamp_min(tiny).log()).clamp_min(tiny).log()
     return top_rows(key, min(max(count, 0), int((weight > 0).sum()))).to(weight.device)

@@ -49,10 +49,10 @@ def attribute_rows(splats: RawSplats, attribute: str) -> Tensor:
 
 def codes_of(splats: RawSplats, attribute: str, quantizer: Quantizer) -> Tensor:
     """Codes ``[N]`` of an attribute: the frozen ones, those that are held, or the nearest ones now."""
-    held = held_codes(quantizer, splats.means.shape[0])
+    held = held_codes(quantizer, len(splats.means))
     if held is not None:
         return held
-    if quantizer.codes.shape[0] == splats.means.shape[0]:
+    if len(quantizer.codes) == len(splats.means):
         return quantizer.codes
     return quantizer.encode(attribute_rows(splats, attribute))
 

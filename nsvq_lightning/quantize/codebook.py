@@ -111,7 +111,7 @@ class CodebookQuantizer(nn.Module, ABC):
     @property
     def num_codes(self) -> int:
         """Number of codes, K."""
-        return self.codebook.shape[0]
+        return len(self.codebook)
 
     @property
     def dim(self) -> int:
@@ -140,7 +140,7 @@ class CodebookQuantizer(nn.Module, ABC):
             raise ValueError(f"rows must have shape [N, {self.dim}], got {list(x.shape)}")
         spread = self.start == "spread"
         centroids = kmeans(x, self.max_codes, generator or seeded(0), weight, self.kmeans_steps, spread=spread)
-        self._resize(centroids.shape[0])
+        self._resize(len(centroids))
         with torch.no_grad():
             self.codebook.copy_(centroids)
         self.fitted.fill_(True)
@@ -174,7 +174,7 @@ class CodebookQuantizer(nn.Module, ABC):
             ValueError: In training no generator is given, or codes are frozen for another number of rows.
         """
         if self.frozen:
-            codes = self._frozen_codes(x.shape[0], rows)
+            codes = self._frozen_codes(len(x), rows)
             return self.decode(codes), codes
         held = held_codes(self, len(x))
         if held is not None and rows is not None:
@@ -302,7 +302,7 @@ class CodebookQuantizer(nn.Module, ABC):
         return self.encode(x if rows is None else x.index_select(0, rows))
 
     def _frozen_codes(self, count: int, rows: Tensor | None) -> Tensor:
-        if count != self.codes.shape[0]:
+        if count != len(self.codes):
             raise ValueError(f"codes are frozen for {len(self.codes)} rows, got {count}; pass all; `rows` chooses")
         return self.codes if rows is None else self.codes[rows]
 
@@ -316,7 +316,7 @@ class CodebookQuantizer(nn.Module, ABC):
         """Resize to the stored number of codes and rows before the values are copied."""
         stored = state_dict.get(f"{prefix}codebook")
         if stored is not None and stored.dim() == 2 and stored.shape[1] == self.dim:
-            self._resize(stored.shape[0])
+            self._resize(len(stored))
         for name in ("codes", "held"):
             rows = state_dict.get(f"{prefix}{name}")
             if rows is not None:
@@ -402,4 +402,4 @@ def as_quantizer(module: object) -> Quantizer:
 def held_codes(quantizer: object, count: int) -> Tensor | None:
     """The codes ``[count]`` that rows hold in training; None if they hold none, or are of another number."""
     held: Tensor | None = getattr(quantizer, "held", None)
-    return held if held is not None and held.shape[0] == count > 0 else None
+    return held if held is not None and len(held) == count > 0 else None

@@ -118,13 +118,13 @@ def kmeans(
     Raises:
         ValueError: A shape does not fit, there is no row, a value is not finite, or a weight is negative.
     """
-    if x.dim() != 2 or x.shape[0] == 0 or k < 1:
+    if x.dim() != 2 or len(x) == 0 or k < 1:
         raise ValueError(f"k-means needs rows [N, D] with N > 0 and k > 0, got shape {list(x.shape)} and k = {k}")
     if bad := int((~torch.isfinite(x).all(1)).sum()):
-        raise ValueError(f"{bad} of {x.shape[0]} rows are not finite; drop them before k-means")
+        raise ValueError(f"{bad} of {len(x)} rows are not finite; drop them before k-means")
     if weight is not None:
         if weight.shape != x.shape[:1] or not (weight >= 0).all() or not (weight > 0).any():
-            raise ValueError(f"weight must have shape [{x.shape[0]}], no negative and at least one positive value")
+            raise ValueError(f"weight must have shape [{len(x)}], no negative and at least one positive value")
         used, weight = weight > 0, weight.double()
         if not used.all():
             x, weight = x[used], weight[used]

@@ -34,7 +34,7 @@ def check_rows(x: Tensor, codebook: Tensor) -> None:
     """
     if x.dim() != 2 or codebook.dim() != 2 or x.shape[1] != codebook.shape[1] or x.shape[1] == 0:
         raise ValueError(f"x [N, D] and codebook [K, D] must share D, got {list(x.shape)} and {list(codebook.shape)}")
-    if codebook.shape[0] == 0:
+    if len(codebook) == 0:
         raise ValueError(f"the codebook has no code, shape {list(codebook.shape)}; fit it first")
     if x.dtype != codebook.dtype or not x.dtype.is_floating_point:
         raise TypeError(f"x and codebook must have one floating-point dtype, got {x.dtype} and {codebook.dtype}")
@@ -59,8 +59,8 @@ def nearest_reference(x: Tensor, codebook: Tensor) -> Tensor:
 def distance_parts(x: Tensor, codebook: Tensor) -> Iterator[tuple[slice, Tensor]]:
     """Rows of ``x [N, D]``, part by part, and their exact distances ``[rows, K]`` to the codes ``[K, D]``, detached."""
     # As many distances at once as fit the caches of a CPU, or are enough to keep a GPU busy.
-    rows = max(1, (1 << 22 if x.device.type == "cpu" else 1 << 26) // codebook.shape[0])
-    for start in range(0, max(1, x.shape[0]), rows):
+    rows = max(1, (1 << 22 if x.device.type == "cpu" else 1 << 26) // len(codebook))
+    for start in range(0, max(1, len(x)), rows):
         part = slice(start, start + rows)
         with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
             distances = torch.cdist(x[part], codebook, compute_mode="donot_use_mm_for_euclid_dist")

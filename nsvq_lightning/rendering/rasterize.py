@@ -92,7 +92,7 @@ def render(
         if tuple(pixel_weights.shape) != (camera.height, camera.width):
             expected = [camera.height, camera.width]
             raise ValueError(f"pixel_weights must be {expected}, got {list(pixel_weights.shape)}")
-        absgrad = means.new_zeros(1, 1).expand(means.shape[0], 3).requires_grad_()
+        absgrad = means.new_zeros(1, 1).expand(len(means), 3).requires_grad_()
         pixel_weights = pixel_weights.detach().to(means).contiguous()
     view_sampling = None
     if antialiased:  # no blur is kept

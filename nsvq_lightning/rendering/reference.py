@@ -147,7 +147,7 @@ def render(
     rows = visible(splats, camera, sampling)
     shown = splats.take(rows)
     projection = project(shown, camera, None if sampling is None else sampling.of(rows))
-    n = splats.means.shape[0]
+    n = len(splats.means)
     means2d = splats.means.new_zeros(n, 2).index_copy(0, rows, projection.means2d)
     radii = rows.new_zeros(n, dtype=torch.int32)
     radii[rows] = projection.half_sizes.amax(-1).ceil().clamp_max(2**30).to(torch.int32)
@@ -234,7 +234,7 @@ def _blend(
     with torch.no_grad():
         running = (1 - alpha).cumprod(1) >= constants.TRANSMITTANCE_MIN
     alpha = torch.where(running, alpha, torch.zeros_like(alpha))
-    transmittance = torch.cat([pixels.new_ones(pixels.shape[0], 1), (1 - alpha).cumprod(1)], 1)
+    transmittance = torch.cat([pixels.new_ones(len(pixels), 1), (1 - alpha).cumprod(1)], 1)
     weights = alpha * transmittance[:, :-1]
     weights = _WatchWeights.apply(weights, pixel_weights, absgrad[:, 2])  # type: ignore[no-untyped-call]
     return torch.cat([weights @ features, transmittance[:, -1:]], 1)

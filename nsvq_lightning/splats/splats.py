@@ -55,7 +55,7 @@ def check_shapes(tensors: Mapping[str, Tensor]) -> None:
     if shN.dim() != 3 or shN.shape[2] != 3:
         raise ValueError(f"shN must have shape [N, (degree + 1)^2 - 1, 3], got {list(shN.shape)}")
     for name, shape in attribute_shapes(sh_degree_of(shN)).items():
-        expected = [tensors["means"].shape[0], *shape]
+        expected = [len(tensors["means"]), *shape]
         if list(tensors[name].shape) != expected:
             raise ValueError(f"{name} must have shape {expected}, got {list(tensors[name].shape)}")
 
@@ -138,7 +138,7 @@ class Splats(nn.Module):
         _, first = np.unique(points[finite].numpy(), axis=0, return_index=True)
         rows = finite.nonzero()[:, 0][torch.from_numpy(np.sort(first))]
         points, colors = points[rows], colors[rows]
-        n = points.shape[0]
+        n = len(points)
         if n == 0:
             raise ValueError("the point cloud has no finite point; reconstruct the scene again or start from a .ply")
         spread = _mean_squared_neighbour_distance(points).clamp(1e-7, 4.0)
@@ -152,7 +152,7 @@ class Splats(nn.Module):
         )
 
     def __len__(self) -> int:
-        return self.means.shape[0]
+        return len(self.means)
 
     @property
     def sh_degree(self) -> int:
@@ -204,7 +204,7 @@ def detached(splats: SplatTensors) -> RawSplats:
 
 def _mean_squared_neighbour_distance(points: Tensor) -> Tensor:
     """Mean squared distance ``[N]`` of distinct points ``[N, 3]`` to their three nearest neighbours."""
-    neighbours = min(3, points.shape[0] - 1)
+    neighbours = min(3, len(points) - 1)
     if neighbours == 0:
         return torch.ones(1)
     from scipy.spatial import cKDTree  # takes longer to import than all that a render needs beside torch

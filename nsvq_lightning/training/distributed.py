@@ -50,7 +50,7 @@ def checksum(tensor: Tensor) -> Tensor:
         tensor: Float32, any shape.
     """
     bits = tensor.detach().contiguous().view(-1).view(torch.int32).long()
-    return (bits * torch.arange(1, bits.shape[0] + 1, device=bits.device)).sum()
+    return (bits * torch.arange(1, len(bits) + 1, device=bits.device)).sum()
 
 
 def check_replicas(trainer: Trainer, event: str) -> None:

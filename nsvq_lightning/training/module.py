@@ -126,7 +126,7 @@ class SplatModule(LightningModule):
         self.splats = splats if splats is not None else Splats(sh_degree)
         self.codebooks = nn.ModuleDict(build_quantizers(quantizer, codebooks, self.splats))
         self.quantizer_settings = {
-            name: {"quantizer": type(made).__name__, "codes": made.codebook.shape[0]}
+            name: {"quantizer": type(made).__name__, "codes": len(made.codebook)}
             for name, made in self.quantizers.items()
         }
         self.background: str = background

@@ -61,7 +61,7 @@ def keep_rows(splats: Splats, optimizer: Optimizer, mask: Tensor) -> None:
     if mask.dtype != torch.bool or mask.shape != (len(splats),):
         raise ValueError(f"mask must be [{len(splats)}] bool, got {list(mask.shape)} {mask.dtype}")
     rows = mask.nonzero()[:, 0]
-    if rows.shape[0] == len(splats):
+    if len(rows) == len(splats):
         return
 
     def select(tensor: Tensor) -> Tensor:

@@ -99,7 +99,7 @@ class SplatScene:
         scene = to_compressed(self.splats.raw(), quantizers)  # PostHoc fits its codebooks only now
         told = {
             "version": __version__,
-            "codebooks": {name: int(quantizer.codebook.shape[0]) for name, quantizer in quantizers.items()},
+            "codebooks": {name: len(quantizer.codebook) for name, quantizer in quantizers.items()},
             "quantizers": {name: type(quantizer).__name__ for name, quantizer in quantizers.items()},
             "background": self.background,
             **settings,

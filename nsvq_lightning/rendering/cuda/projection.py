@@ -228,7 +228,7 @@ def _launch_projection(
     boxes: Tensor,
     means2d: Tensor,
 ) -> Tensor:
-    n, shN = attributes[0].shape[0], attributes[-1]
+    n, shN = len(attributes[0]), attributes[-1]
     _check_attributes(lens, attributes, sampling)
     radii = shN.new_zeros(n, dtype=torch.int32)
     if n:
@@ -264,7 +264,7 @@ def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int, sampling: V
         TypeError: A dtype is wrong.
     """
     means = attributes[0]
-    n = means.shape[0]
+    n = len(means)
     records = means.new_empty(n, rec.RECORD.value)
     boxes = means.new_empty(n, 4, dtype=torch.int32)
     means2d = means.new_zeros(n, 2)
@@ -308,7 +308,7 @@ def project_backward(
     check_tensor("g_means2d", g_means2d, (len(attributes[0]), 2), device)
     gradients = [torch.empty_like(attribute) for attribute in attributes]
     means, quats, scales, logits, _, shN = attributes
-    n = means.shape[0]
+    n = len(means)
     ranks = means.new_full((n,), -1, dtype=torch.int32)
     ranks[ids] = torch.arange(len(ids), dtype=torch.int32, device=device)
     if n:
