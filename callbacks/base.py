@@ -176,7 +176,7 @@ def has_gradients(trainer: Trainer) -> bool:
     return any(parameter.grad is not None for group in groups for parameter in group["params"])
 
 
-def keep_finite_splats(trainer: Trainer, module: SplatModule) -> None:
+def keep_finite_splats(module: SplatModule) -> None:
     """Drop non-finite splats, with their frozen codes (:func:`nsvq_lightning.training.row_ops.drop_non_finite`).
 
     The replicas of several processes are equal, so all drop the same splats without communication. Dropping splats
@@ -185,6 +185,7 @@ def keep_finite_splats(trainer: Trainer, module: SplatModule) -> None:
     Raises:
         FloatingPointError: No finite splat is left.
     """
+    trainer = module.trainer
     kept = row_ops.drop_non_finite(module.splats, trainer.optimizers[0], trainer.global_step)
     if len(module.splats) == len(kept):
         return

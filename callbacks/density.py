@@ -97,21 +97,21 @@ class Densification(SplatCallback, ABC):
     def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Drop non-finite splats, then do what is due."""
         if finite_search_is_due(trainer, self.finite_every):
-            keep_finite_splats(trainer, module)
+            keep_finite_splats(module)
         self.act(trainer, module, iteration)
 
     @torch.no_grad()
-    def prune(self, trainer: Trainer, module: SplatModule, mask: Tensor) -> int:
+    def prune(self, module: SplatModule, mask: Tensor) -> int:
         """Remove the splats of ``mask [N]``, unless fewer than :attr:`min_splats` would be left; returns how many."""
         count = int(mask.sum())
         if len(module.splats) - count < self.min_splats:
             log.warning(
-                f"iteration {trainer.global_step}: pruning {count} of {len(module.splats)} splats would leave fewer "
-                f"than min_splats={self.min_splats}; skipped. Opacities or scales have collapsed: lower the learning "
-                "rates, or check the camera poses"
+                f"iteration {module.trainer.global_step}: pruning {count} of {len(module.splats)} splats would leave "
+                f"fewer than min_splats={self.min_splats}; skipped. Opacities or scales have collapsed: lower the "
+                "learning rates, or check the camera poses"
             )
             return 0
-        row_ops.keep_rows(module.splats, trainer.optimizers[0], ~mask)
+        row_ops.keep_rows(module.splats, module.trainer.optimizers[0], ~mask)
         return count
 
     def _observe(self, trainer: Trainer, module: SplatModule, outputs: dict[str, Any]) -> None:
@@ -144,13 +144,13 @@ class Densification(SplatCallback, ABC):
             for table, total in zip(tables, distributed.sum_over_processes(trainer, torch.stack(own)), strict=True):
                 table.add_(total)
 
-    def divide(self, trainer: Trainer, module: SplatModule, divided: Tensor, new: RawSplats) -> int:
+    def divide(self, module: SplatModule, divided: Tensor, new: RawSplats) -> int:
         """Put new splats in place of those of ``divided [N]``, and begin the statistics anew.
 
         Returns:
             How many splats there are more.
         """
-        splats, optimizer, before = module.splats, trainer.optimizers[0], len(module.splats)
+        splats, optimizer, before = module.splats, module.trainer.optimizers[0], len(module.splats)
         row_ops.append_rows(splats, optimizer, new)
         row_ops.keep_rows(splats, optimizer, torch.cat([~divided, divided.new_ones(len(splats) - before)]))
         for name in self.tables:
@@ -250,22 +250,22 @@ class DensityControl(Densification):
         growing = schedule.phase_at(iteration) is Phase.WARMUP
         due = self.is_due(module, iteration)
         if due and growing:
-            added = self._grow(trainer, module, iteration)
-            pruned = self._prune(trainer, module, huge=iteration > schedule.iteration(self.huge_after))
+            added = self._grow(module, iteration)
+            pruned = self._prune(module, huge=iteration > schedule.iteration(self.huge_after))
             distributed.check_replicas(trainer, "density control")
             log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
         elif due:
-            pruned = self._prune(trainer, module, huge=False)
+            pruned = self._prune(module, huge=False)
             distributed.check_replicas(trainer, "pruning")
             level = logging.INFO if pruned else logging.DEBUG
             log.log(level, "iteration %d: pruned %d splats, %d remain", iteration, pruned, len(module.splats))
         on_white = module.background == "white" and self.white_reset > 0
         first = on_white and iteration == schedule.iteration(self.white_reset)
         if growing and (first or iteration in schedule.reset_times(self.reset_last, self.reset_every)):
-            reset_opacities(trainer, module, self.reset_opacity)
+            reset_opacities(module, self.reset_opacity)
 
     @torch.no_grad()
-    def _grow(self, trainer: Trainer, module: SplatModule, iteration: int) -> int:
+    def _grow(self, module: SplatModule, iteration: int) -> int:
         """Clone and split; returns how many splats were added. Resets the statistics."""
         splats = module.splats
         gradient_sum, views = (splats.add_table(name) for name in self.tables)
@@ -279,25 +279,25 @@ class DensityControl(Densification):
         clones, parents = (detached(splats).take(mask) for mask in chosen)
         children = split(parents, self.shrink, generator(module.seed, iteration, "split"))
         new = RawSplats(*map(torch.cat, zip(clones, children, strict=True)))
-        return self.divide(trainer, module, grown & large, new)
+        return self.divide(module, grown & large, new)
 
-    def _prune(self, trainer: Trainer, module: SplatModule, *, huge: bool) -> int:
+    def _prune(self, module: SplatModule, *, huge: bool) -> int:
         """Prune transparent splats, and huge ones if asked for; returns how many."""
         splats = module.splats
         marked = splats.opacities.sigmoid() < self.min_opacity
         if huge:
             marked |= splats.scales.amax(1).exp() > self.huge_fraction * module.extent
-        return self.prune(trainer, module, marked)
+        return self.prune(module, marked)
 
 
 @torch.no_grad()
-def reset_opacities(trainer: Trainer, module: SplatModule, ceiling: float) -> None:
+def reset_opacities(module: SplatModule, ceiling: float) -> None:
     """Lower all opacities to at most ``ceiling``, and forget their moments."""
-    optimizer = trainer.optimizers[0]
+    optimizer = module.trainer.optimizers[0]
     lowered = module.splats.opacities.clamp(max=math.log(ceiling / (1.0 - ceiling)))
     row_ops.replace_attribute(module.splats, optimizer, "opacities", lowered)
     row_ops.reset_moments(optimizer, "opacities")
-    distributed.check_replicas(trainer, "the opacity reset")
+    distributed.check_replicas(module.trainer, "the opacity reset")
 
 
 def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, width: int, height: int) -> None:

@@ -248,25 +248,25 @@ class BudgetedGrowth(Densification):
         if schedule.phase_at(iteration) is not Phase.WARMUP:
             return
         if self.first_prune and iteration == schedule.iteration(self.first_prune):
-            self.prune(trainer, module, module.splats.opacities.sigmoid() < self.first_opacity)
+            self.prune(module, module.splats.opacities.sigmoid() < self.first_opacity)
         if self.is_due(module, iteration):
-            self._split_and_prune(trainer, module, iteration)
+            self._split_and_prune(module, iteration)
         resets = schedule.reset_times(self.reset_last, self.reset_every)
         if iteration in resets:
-            reset_opacities(trainer, module, self.reset_opacity)
+            reset_opacities(module, self.reset_opacity)
         if iteration in (reset + schedule.interval(self.recovery) for reset in resets[: self.recoveries]):
             transparency = -module.splats.opacities
-            self.prune(trainer, module, top_rows(transparency, int(self.recovery_share * len(transparency))))
+            self.prune(module, top_rows(transparency, int(self.recovery_share * len(transparency))))
 
-    def _split_and_prune(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
+    def _split_and_prune(self, module: SplatModule, iteration: int) -> None:
         """Split, prune unless it is the last time, and end the phase where splitting has become idle."""
         schedule = module.schedule
         last = schedule.ends[Phase.WARMUP]
-        room, added = self._grow(trainer, module, iteration)
+        room, added = self._grow(module, iteration)
         pruned = 0
         if any(self.is_due(module, later) for later in range(iteration + 1, last + 1)):
-            pruned = self.prune(trainer, module, module.splats.opacities.sigmoid() < self.min_opacity)
-        distributed.check_replicas(trainer, "growth")
+            pruned = self.prune(module, module.splats.opacities.sigmoid() < self.min_opacity)
+        distributed.check_replicas(module.trainer, "growth")
         log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
         self.idle = self.idle + 1 if added <= IDLE * min(room, len(module.splats)) else 0
         if self.idle >= self.patience > 0:
@@ -277,7 +277,7 @@ class BudgetedGrowth(Densification):
             )
 
     @torch.no_grad()
-    def _grow(self, trainer: Trainer, module: SplatModule, iteration: int) -> tuple[int, int]:
+    def _grow(self, module: SplatModule, iteration: int) -> tuple[int, int]:
         """Split as many splats as the budget allows; returns how many that was, and were. Resets the statistics."""
         splats, schedule = module.splats, module.schedule
         gradients, views, edges = (splats.add_table(name) for name in self.tables)
@@ -290,7 +290,7 @@ class BudgetedGrowth(Densification):
         room = int(self.limit(module) * math.sqrt(progress)) - len(splats)
         divided = draw_rows(candidates, room, generator(module.seed, iteration, "grow"))
         parents = detached(splats).take(divided)
-        return room, self.divide(trainer, module, divided, split_longest(parents))
+        return room, self.divide(module, divided, split_longest(parents))
 
 
 def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:

@@ -93,7 +93,7 @@ class CodebookInit(SplatCallback):
         """Fit when due."""
         if not self.is_due(module, iteration):
             return
-        keep_finite_splats(trainer, module)
+        keep_finite_splats(module)
         weights = row_weights(run_scene.train_contributions(trainer, module.scene)) if self.weighted else None
         for name, quantizer in module.quantizers.items():
             if trainer.is_global_zero:
@@ -168,7 +168,7 @@ class CodebookReplacement(SplatCallback):
         if not self.is_due(module, iteration):
             return
         if self.jitter is not None:
-            keep_finite_splats(trainer, module)
+            keep_finite_splats(module)
         values = {}
         for name, quantizer in module.quantizers.items():
             _sum_usage(trainer, quantizer)
@@ -240,7 +240,7 @@ class CodebookRefit(SplatCallback):
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Drop non-finite splats before a refit to all rows: after the backward pass this would lose the gradients."""
         if self.is_due(module, iteration) and _refittable(module):
-            keep_finite_splats(trainer, module)
+            keep_finite_splats(module)
 
     def on_before_optimizer_step(self, trainer: Trainer, module: SplatModule, optimizer: Optimizer) -> None:
         """Refit when due, on the first process."""
@@ -422,7 +422,7 @@ class FreezeCodes(SplatCallback):
         return [name for name, codes in frozen.items() if len(codes) != count or (edited and codes is before[name])]
 
     def _freeze(self, trainer: Trainer, module: SplatModule, names: Iterable[str]) -> None:
-        keep_finite_splats(trainer, module)
+        keep_finite_splats(module)
         for name in names:
             quantizer = module.quantizers[name]
             held = held_codes(quantizer, len(module.splats))

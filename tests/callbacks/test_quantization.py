@@ -127,7 +127,7 @@ def refit(trainer: Any, steps: int = 2) -> dict[str, Any]:
     for quantizer in quantizers.values():
         quantizer.fit(ROWS - 1)
     scene = SimpleNamespace(rows=lambda name: ROWS)
-    host: Any = SimpleNamespace(schedule=Schedule(), quantizers=quantizers, scene=scene)
+    host: Any = SimpleNamespace(schedule=Schedule(), quantizers=quantizers, scene=scene, trainer=trainer)
     CodebookRefit(steps=steps).on_before_optimizer_step(trainer, host, None)  # type: ignore[arg-type]
     return quantizers
 
@@ -170,13 +170,14 @@ class Stage:
             self.quantizer.codebook.copy_(self.splats.scales)
         self.quantizer.fitted.fill_(True)
         self.callback = FreezeCodes()
+        self.trainer: Any = SimpleNamespace(optimizers=[self.optimizer], global_step=0, world_size=1)
         self.module: Any = SimpleNamespace(
             splats=self.splats,
             quantizers={"scales": self.quantizer},
             schedule=Schedule(),
             scene=SimpleNamespace(rows=lambda name: self.splats.scales.detach()),
+            trainer=self.trainer,
         )
-        self.trainer: Any = SimpleNamespace(optimizers=[self.optimizer], global_step=0, world_size=1)
         assert self.module.schedule.first_of(Phase.FINETUNE) == FIRST
 
     def start(self, iteration: int) -> list[int]:
@@ -228,7 +229,7 @@ def test_codes_that_follow_an_edit_are_not_searched_again(caplog: pytest.LogCapt
     with torch.no_grad():
         stage.splats.scales.zero_()
         stage.splats.quats[1] = math.nan
-    keep_finite_splats(stage.trainer, stage.module)
+    keep_finite_splats(stage.module)
     caplog.clear()
     assert stage.start(FIRST + 1) == [0, 2, 3]
     assert not caplog.records
