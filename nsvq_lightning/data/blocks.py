@@ -54,7 +54,7 @@ class Block:
 
         Cores have no point in common, and each point is in one.
         """
-        ground = points.astype(np.float64) @ np.array(self.axes).T
+        ground = points @ np.array(self.axes).T
         low, high = (1 - share) * np.array(self.core) + share * np.array(self.around)
         return np.asarray(((ground >= low) & (ground < high)).all(1))
 

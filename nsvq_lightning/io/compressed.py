@@ -197,7 +197,7 @@ class CompressedScene:
         else:
             rows = self.raw[name] if name in self.raw else getattr(self, name)
         if name in self.bases:  # exact in float64 for whole numbers, so rounded once
-            rows = (rows.astype(np.float64) @ self.bases[name].astype(np.float64)).astype(np.float32)
+            rows = (rows @ self.bases[name].astype(np.float64)).astype(np.float32)
         return rows.reshape(len(rows), splat.attribute_dims(self.sh_degree)[name])
 
     def values(self, name: str) -> Float32s:
@@ -263,7 +263,7 @@ class CompressedScene:
             low: Smallest world coordinates ``[3]``.
             high: Largest ``[3]``.
         """
-        positions = self.means.astype(np.float64) + np.array(self.origin)
+        positions = self.means + np.array(self.origin)
         inside = (positions >= low) & (positions <= high)
         return self.take(inside.all(1))
 
@@ -279,7 +279,7 @@ class CompressedScene:
         """The same scene with another origin of its positions."""
         if self.origin == origin:
             return self
-        means = self.means.astype(np.float64) + self.origin - origin
+        means = self.means + np.array(self.origin) - origin
         cameras = self.cameras + np.append(np.subtract(self.origin, origin), 0)
         return replace(self, means=means.astype(np.float32), origin=origin, cameras=cameras)
 

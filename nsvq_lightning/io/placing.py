@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.splats.conventions import Float32s, Float64s, turned
+from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, turned
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.frame import Frame
@@ -73,12 +73,12 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     rotation = linear / size
     harmonics = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
 
-    def turned_harmonics(rows: Float32s) -> Float64s:
-        coefficients = rows.reshape(len(rows), len(harmonics), 3).astype(np.float64)
+    def turned_harmonics(rows: Float32s) -> Arrays:
+        coefficients = rows.reshape(len(rows), len(harmonics), 3)
         return (harmonics @ coefficients).reshape(rows.shape)
 
     has_origin = any(scene.origin)
-    means = scene.means.astype(np.float64) @ linear.T + (0 if has_origin else shift)
+    means = scene.means @ linear.T + (0 if has_origin else shift)
     origin = linear @ np.array(scene.origin) + (shift if has_origin else 0)
     cameras = scene.cameras.copy()
     cameras[:, :3] = cameras[:, :3] @ linear.T + (0 if has_origin else shift)
