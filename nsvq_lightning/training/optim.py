@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -48,12 +48,11 @@ class LearningRates:
     scale_with_views: bool = False
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            positive = field.name.startswith("means")  # interpolated in the logarithm
+        for name, value in vars(self).items():
+            positive = name.startswith("means")  # interpolated in the logarithm
             if not (math.isfinite(value) and (value > 0 if positive else value >= 0)):
                 bound = "above" if positive else "at least"
-                raise ValueError(f"rate {field.name} must be finite and {bound} 0, got {value}")
+                raise ValueError(f"rate {name} must be finite and {bound} 0, got {value}")
 
 
 def position_lr(iteration: int, extent: float, rates: LearningRates, decay_end: int) -> float:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 from nsvq_lightning.splats.attributes import ATTRIBUTES
@@ -42,10 +42,9 @@ class Precision:
     shN: float = ATTRIBUTES["shN"].error
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            value = getattr(self, entry.name)
+        for name, value in vars(self).items():
             if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"precision: {entry.name} must be a positive number, got {value}")
+                raise ValueError(f"precision: {name} must be a positive number, got {value}")
         low, high = OPACITY_ERRORS
         if not low <= self.opacity <= high:
             raise ValueError(f"precision: opacity must be from {low:.3g} to {high:g}, got {self.opacity}")
