@@ -136,9 +136,9 @@ def render(
     camera: Camera,
     sh_degree: int,
     background: Tensor,
-    pixel_weights: Tensor | None = None,
-    absgrad: Tensor | None = None,
-    sampling: ViewSampling | None = None,
+    pixel_weights: Tensor | None,
+    absgrad: Tensor | None,
+    sampling: ViewSampling | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``, differentiable.
 

@@ -250,7 +250,7 @@ def blend_backward(
     ends: Tensor,
     outputs: tuple[Tensor, Tensor, Tensor],
     gradients: tuple[Tensor | None, Tensor | None, Tensor | None],
-    pixel_weights: Tensor | None = None,
+    pixel_weights: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Moments ``[V, RECORD]`` of the splats in view; of all splats the gradients of the centres.
 

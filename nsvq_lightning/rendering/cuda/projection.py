@@ -282,7 +282,7 @@ def project_backward(
     records: Tensor,
     totals: Tensor,
     g_means2d: Tensor,
-    sampling: ViewSampling | None = None,
+    sampling: ViewSampling | None,
 ) -> list[Tensor]:
     """Gradients of the six attributes, 0 for splats not in view.
 
