@@ -236,7 +236,7 @@ def trained_scene(path: Path, root: Path | None) -> "CompressedScene":
     scene = read_scene(path)
     if len(scene.cameras):
         return scene
-    cameras: list[Camera] = []
+    cameras = []
     try:
         cameras = list(cameras_of(path, root, scene.means).values())
     except (ValueError, OSError) as error:

@@ -263,7 +263,7 @@ class Compressor:
         Raises:
             ValueError: None was found.
         """
-        fits: Candidate | None = None
+        fits = None
         if 8 * target >= ON_BASIS * splats:
             plain = Setting(splats, "none", self.scene.sh_degree > 0)
             exact = self.at(replace(plain, on_basis=False))

@@ -18,7 +18,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, Json, check_room, json_object, naming_file, wrong_start
 from nsvq_lightning.io.numbers import finite_logs, logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, moved, rotated
-from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s, sh_coefficients, unit
+from nsvq_lightning.splats.conventions import SH_C0, Float32s, Float64s, sh_coefficients, unit
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
     # The fallback is linear light; what the splats have is meant for display.
     shown = np.clip(0.5 + SH_C0 * base.astype(np.float64), 0, 1)
     linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
-    arrays: dict[str, Arrays] = {
+    arrays = {
         "POSITION": scene.means,
         "COLOR_0": np.rint(255 * np.c_[linear, opacities]).astype(np.uint8),
         f"{EXTENSION}:ROTATION": unit(scene.rows("quats"))[:, [1, 2, 3, 0]].astype(np.float32),
@@ -62,8 +62,8 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
         **{_harmonic(number + 1): higher[:, number] for number in range(higher.shape[1])},
     }
     kinds = {width: name for name, width in _WIDTHS.items()}
-    views: list[Json] = []
-    accessors: list[Json] = []
+    views = []
+    accessors = []
     end = 0
     for number, values in enumerate(arrays.values()):
         is_byte = values.dtype == np.uint8

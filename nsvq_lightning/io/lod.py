@@ -54,7 +54,7 @@ def write_lod(
     if any(a <= b for a, b in itertools.pairwise(counts)):
         raise ValueError(f"each level must have fewer splats than the one before it, got {counts}")
     tree, leaves = _tree(levels)
-    old: list[str] = []
+    old = []
     with suppress(FileNotFoundError, FormatError):
         old = _index(target)["filenames"]
     make_folder_of(target)
@@ -105,7 +105,7 @@ def _tree(levels: Sequence[CompressedScene]) -> tuple[Json, list[tuple[list[Inte
     means = np.concatenate([level.means for level in levels])
     boxes = np.concatenate([_boxes(level) for level in levels])
     starts = np.cumsum([0, *map(len, levels)])
-    leaves: list[tuple[list[Integers], Json]] = []
+    leaves = []
 
     def node(splats: Integers) -> Json:
         low, high = boxes[splats, 0].min(0), boxes[splats, 1].max(0)

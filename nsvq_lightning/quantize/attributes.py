@@ -30,7 +30,7 @@ def build_quantizers(
     unknown = sorted(set(sizes) - set(QUANTIZED))
     if unknown:
         raise ValueError(f"codebooks: unknown attributes {', '.join(unknown)}; choose from {', '.join(QUANTIZED)}")
-    built: dict[str, nn.Module] = {}
+    built = {}
     for name in QUANTIZED:
         dim = getattr(splats, name).shape[1:].numel()
         if name not in sizes or dim == 0:

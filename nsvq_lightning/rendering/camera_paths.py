@@ -178,7 +178,7 @@ def read_cameras(path: Path) -> dict[str, Camera]:
         ValueError: It is no such list.
         OSError: It cannot be read.
     """
-    cameras: dict[str, Camera] = {}
+    cameras = {}
     advice = ": move it away, or name the photos with --data.root"
     with _refused(f"{path} is no list of cameras as INRIA's trainer writes it", advice):
         for entry in json.loads(path.read_bytes()):

@@ -172,7 +172,7 @@ def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> Float64s:
     """
     scales, levels = stored["scales"], stored["opacities"]
     factor = scales.entry.step / 3 / math.log(2.0)
-    doublings: Float64s = scales.row_sums().astype(np.float64) * factor + for_size_one
+    doublings = scales.row_sums().astype(np.float64) * factor + for_size_one
     # The logarithm, linear between powers of two.
     mantissas, exponents = np.frexp((np.arange(levels.entry.codes) + 0.5) / levels.entry.codes)
     doublings -= (0.5 * (2 * mantissas - 2 + exponents))[levels.values]
