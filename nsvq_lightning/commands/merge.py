@@ -9,8 +9,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.split import RUN
 
@@ -49,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
     parts = []
     for folder, block, file in zip(folders, blocks, files, strict=True):
         whole = read_scene(file)
-        part = whole.take(block.contains(whole.means + np.array(whole.origin))).in_use()
+        part = whole.take(block.contains(whole.means + whole.origin)).in_use()
         say(f"{folder}: {len(part):,} of {len(whole):,} splats are in its core")
         parts.append(part)
     photos = load_scene(blocks[0].scene)

@@ -279,7 +279,7 @@ class CompressedScene:
         """The same scene with another origin of its positions."""
         if self.origin == origin:
             return self
-        means = self.means + np.array(self.origin) - origin
+        means = self.means + self.origin - origin
         cameras = self.cameras + np.append(np.subtract(self.origin, origin), 0)
         return replace(self, means=means.astype(np.float32), origin=origin, cameras=cameras)
 

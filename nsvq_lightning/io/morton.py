@@ -63,7 +63,7 @@ class Grid:
 
     def cells(self, means: Float32s) -> tuple[Int64s, Bools]:
         """Cell of each position ``[N, 3]``, 0 for those outside; and which ``[N]`` are inside."""
-        cells = np.floor(means.astype(np.float64) / self.step) - np.array(self.base, np.float64)
+        cells = np.floor(means.astype(np.float64) / self.step) - self.base
         inside = np.logical_and.reduce((cells >= 0) & (cells < 1 << AXIS_BITS), axis=1)
         return np.where(inside[:, None], cells, 0).astype(np.int64), inside
 
@@ -75,7 +75,7 @@ class Grid:
         """Centre of the cell of ``depths [N]`` bits that holds each cell ``[N, 3]``, scene units."""
         shift = (AXIS_BITS - depths)[:, None]
         corners = cells >> shift << shift
-        middles = corners + 0.5 * (np.int64(1) << shift) + np.array(self.base, np.float64)
+        middles = corners + 0.5 * (np.int64(1) << shift) + self.base
         return (middles * self.step).astype(np.float32)
 
 

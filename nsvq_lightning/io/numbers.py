@@ -120,5 +120,5 @@ def coarsest_power(values: Float32s) -> float:
     """The largest power of two of which all ``values`` are integer multiples, 0 if all are 0; they must be finite."""
     mantissas, exponents = np.frexp(values[values != 0])
     wholes = np.ldexp(mantissas, 24).astype(np.int64)  # float32 has so many bits
-    powers = np.ldexp((wholes & -wholes).astype(np.float64), exponents - 24)  # of the lowest bit that is set
+    powers = np.ldexp(wholes & -wholes, exponents - 24)  # of the lowest bit that is set
     return float(powers.min()) if powers.size else 0.0

@@ -79,7 +79,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
 
     has_origin = any(scene.origin)
     means = scene.means @ linear.T + (0 if has_origin else shift)
-    origin = linear @ np.array(scene.origin) + (shift if has_origin else 0)
+    origin = linear @ scene.origin + (shift if has_origin else 0)
     cameras = scene.cameras.copy()
     cameras[:, :3] = cameras[:, :3] @ linear.T + (0 if has_origin else shift)
     return scene.changed(
