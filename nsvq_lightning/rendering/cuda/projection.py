@@ -16,7 +16,8 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda import records as rec
 from nsvq_lightning.rendering.cuda.harmonics import color, color_backward, load_row, store_row
 from nsvq_lightning.rendering.sampling import ViewSampling
-from nsvq_lightning.splats.attributes import ATTRIBUTES
+from nsvq_lightning.splats.attributes import attribute_shapes
+from nsvq_lightning.splats.splats import sh_degree_of
 
 formulas = for_triton(shared)
 # Places of the limits of slopes and of the near plane among the numbers of a camera.
@@ -210,11 +211,11 @@ class Projected(NamedTuple):
 
 
 def _check_attributes(lens: Lens, attributes: tuple[Tensor, ...], sampling: ViewSampling | None) -> None:
-    n, device, coefficients = len(attributes[0]), attributes[0].device, attributes[-1].shape[1]
+    n, device = len(attributes[0]), attributes[0].device
     check_tensor("lens.view", lens.view, (20,), device)
-    shapes = (n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, coefficients, 3)
-    for name, attribute, shape in zip(ATTRIBUTES, attributes, shapes, strict=True):
-        check_tensor(name, attribute, shape, device)
+    shapes = attribute_shapes(sh_degree_of(attributes[-1])).items()
+    for attribute, (name, shape) in zip(attributes, shapes, strict=True):
+        check_tensor(name, attribute, (n, *shape), device)
     if sampling is not None:
         check_tensor("sampling", sampling.distances, (2, n), device)
 
