@@ -105,17 +105,16 @@ class MetricReport(WritingCallback):
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Evaluate the last iteration, now that all callbacks have finished with it."""
-        iteration = trainer.global_step
-        if self.is_due(module, iteration):
-            self._evaluate_once(trainer, module, iteration)
+        if self.is_due(module, trainer.global_step):
+            self._evaluate_once(trainer, module)
 
     def on_train_epoch_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Evaluate the end of the run, before Lightning's own work at the end of its only epoch."""
-        self._evaluate_once(trainer, module, trainer.global_step)
+        self._evaluate_once(trainer, module)
 
     def on_train_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Evaluate the end of the run if no epoch has ended, and draw the curve."""
-        self._evaluate_once(trainer, module, trainer.global_step)
+        self._evaluate_once(trainer, module)
         folder = run_folder(trainer)
         if trainer.is_global_zero and module.history and not is_fast_dev_run(trainer):
             with module.stopwatch.paused(module.device):
@@ -129,8 +128,9 @@ class MetricReport(WritingCallback):
         if trainer.global_step and not (run_folder(trainer) / "curve.png").exists():
             self.on_train_end(trainer, module)
 
-    def _evaluate_once(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
+    def _evaluate_once(self, trainer: Trainer, module: SplatModule) -> None:
         """Evaluate an iteration that was not evaluated yet, and notify the callbacks that monitor it."""
+        iteration = trainer.global_step
         done = module.history[-1]["iteration"] if module.history else 0
         if iteration <= done or is_fast_dev_run(trainer):
             return
