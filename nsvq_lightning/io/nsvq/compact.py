@@ -23,13 +23,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import torch
 
-from nsvq_lightning.io import errors, morton
+from nsvq_lightning.io import morton
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.io.nsvq import entropy, rounding
+from nsvq_lightning.io.errors import FEW_ROWS, FormatError, check_room
+from nsvq_lightning.io.nsvq import entropy
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 from nsvq_lightning.io.nsvq.precision import MAX_OPACITY_LEVELS, Precision
-from nsvq_lightning.io.nsvq.rounding import leaf_paths
+from nsvq_lightning.io.nsvq.rounding import SMALL, Stored, doublings_of, leaf_paths, position_grid, rounded
 from nsvq_lightning.io.numbers import logits_of
 from nsvq_lightning.splats.attributes import QUANTIZABLE
 from nsvq_lightning.splats.conventions import Int32s, Int64s, Uint64s
@@ -67,9 +67,9 @@ def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header
     with _workers() as pool:
         along = morton.spatial_order(scene.means)
         names = (*_EARLY, *_LONGEST_FIRST)
-        tasks = {name: pool.submit(rounding.rounded, scene, name, precision, along) for name in names}
+        tasks = {name: pool.submit(rounded, scene, name, precision, along) for name in names}
         early = {name: tasks[name].result() for name in _EARLY}
-        grid, doublings, depths = rounding.position_grid(scene.means, early, precision)
+        grid, doublings, depths = position_grid(scene.means, early, precision)
         cells, inside = grid.cells(scene.means)
         keys = morton.morton_keys(cells, depths)
         # The order of the file: along the Morton curve, the far splats, whose keys are 0, at the end.
@@ -110,7 +110,7 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
     with _workers() as pool:
         early = {name: pool.submit(_decoded, entries[name], streams, _before(header.splats)) for name in _EARLY}
         stored = {name: early[name].result() for name in _EARLY}
-        depths = grid.depths(rounding.doublings_of(stored, doublings))[: header.splats - len(far)]
+        depths = grid.depths(doublings_of(stored, doublings))[: header.splats - len(far)]
         keys = entropy.decode_keys(streams["means"], 3 * depths)
         neighbours = _neighbours(keys, depths, header.splats)
         late = {name: pool.submit(_decoded, entries[name], streams, neighbours) for name in _LONGEST_FIRST}
@@ -159,7 +159,7 @@ def _stream_names(attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, str
     return [(entry.name + end, kind) for entry in attributes for end, kind in _STREAMS[entry.storage].items()]
 
 
-def _encoded(attribute: rounding.Stored, order: Int64s, neighbours: Int32s) -> dict[str, bytes]:
+def _encoded(attribute: Stored, order: Int64s, neighbours: Int32s) -> dict[str, bytes]:
     """The streams of an attribute, but not of the positions, for splats in an order."""
     entry = attribute.entry
     if _STREAMS[entry.storage][""] == "paths":
@@ -172,7 +172,7 @@ def _encoded(attribute: rounding.Stored, order: Int64s, neighbours: Int32s) -> d
     return streams
 
 
-def _decoded(entry: AttributeEntry, streams: Mapping[str, memoryview], near: Int32s) -> rounding.Stored:
+def _decoded(entry: AttributeEntry, streams: Mapping[str, memoryview], near: Int32s) -> Stored:
     """Invert :func:`_encoded`."""
     own = streams[entry.name]
     codebook = None
@@ -188,9 +188,9 @@ def _decoded(entry: AttributeEntry, streams: Mapping[str, memoryview], near: Int
         values = entropy.decode_integers(own, len(near), entry.codes or entry.dim)
     if codebook is not None and entry.storage == "components":
         for integers in (codebook, values):
-            if np.abs(integers).max(initial=0) >= rounding.SMALL:
+            if np.abs(integers).max(initial=0) >= SMALL:
                 raise FormatError(f"damaged: a component of {entry.name} is not below 2^23 in size")
-    return rounding.Stored(entry, values, codebook)
+    return Stored(entry, values, codebook)
 
 
 def _check_tables(header: Header) -> None:
@@ -202,11 +202,11 @@ def _check_tables(header: Header) -> None:
     far, rest = divmod(lengths["means.far"], 12)  # three float32
     if lengths["means.grid"] != _GRID.size or rest or far > header.splats:
         raise FormatError("damaged: the streams of the positions do not have their sizes")
-    errors.check_room("splats", header.splats, sum(lengths.values()))
+    check_room("splats", header.splats, sum(lengths.values()))
     for entry in header.attributes:
         if entry.storage == "codes":
             name = f"{entry.name}.codebook"
-            errors.check_room(f"rows of {name}", entry.codes, lengths[name], errors.FEW_ROWS, each=1)
+            check_room(f"rows of {name}", entry.codes, lengths[name], FEW_ROWS, each=1)
 
 
 # Attributes that may be stored so.
