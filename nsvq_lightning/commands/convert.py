@@ -13,7 +13,6 @@ Examples:
 
 import argparse
 import logging
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -168,7 +167,7 @@ def _up(options: argparse.Namespace) -> Float64s:
 def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     import torch
 
-    from nsvq_lightning.data.scene import View, load_scene
+    from nsvq_lightning.data.scene import load_scene
     from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.report.numbers import evaluate
     from nsvq_lightning.training.importance import floaters
@@ -177,14 +176,11 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     splats = scene.tensors()
     look = partial(render, antialiased=scene.antialiased)
 
-    def views() -> Iterator[View]:
-        return (photos.view(index) for index in tqdm(photos.train, unit=" photos", mininterval=1))
-
     def psnr(keep: torch.Tensor) -> float:
         kept = splats.take(keep)
         return evaluate(look, kept, map(photos.view, photos.test))[0]
 
-    removed = floaters(splats, views, look)
+    removed = floaters(splats, lambda: map(photos.view, tqdm(photos.train, unit=" photos", mininterval=1)), look)
     before, after = psnr(torch.ones_like(removed)), psnr(~removed)
     count = int(removed.sum())
     say(f"floaters: {count:,} of {len(scene):,} splats; test photos at {before:.2f} dB before, {after:.2f} dB after")

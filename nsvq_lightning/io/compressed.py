@@ -322,17 +322,14 @@ class CompressedScene:
         if degree == self.sh_degree:
             return self
         width = splat.attribute_dims(degree)["shN"]
-
-        def fitted(rows: Float32s) -> Float32s:
-            return np.pad(rows[:, :width], ((0, 0), (0, max(0, width - rows.shape[1]))))
-
         scene = self
         if degree == 0 or "shN" in self.bases:  # no codebook at degree 0, nor a basis of another width
             codes = {name: codes for name, codes in self.codes.items() if name != "shN"}
             codebooks = {name: self.codebooks[name] for name in codes}
             raw = {**self.raw, "shN": self.rows("shN")}
             scene = replace(self, codes=codes, codebooks=codebooks, raw=raw, bases={})
-        return scene.changed({"shN": fitted}, sh_degree=degree)
+        fitted = {"shN": lambda rows: np.pad(rows[:, :width], ((0, 0), (0, max(0, width - rows.shape[1]))))}
+        return scene.changed(fitted, sh_degree=degree)
 
 
 def _check_floats(name: str, array: Float32s, shape: tuple[int, ...]) -> None:

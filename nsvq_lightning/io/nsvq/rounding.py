@@ -37,11 +37,6 @@ class Stored(NamedTuple):
     values: Integers
     codebook: Integers | None = None
 
-    def row_sums(self) -> Int64s:
-        """Sum ``[N]`` of each splat's integers."""
-        sums: Int64s = self.values.sum(1) if self.codebook is None else self.codebook.sum(1)[self.values]
-        return sums
-
     def floats(self) -> Float32s:
         """The codebook ``[K, D]`` or the basis ``[C, D]``, or the rows ``[N, D]`` where there is none."""
         integers = self.values if self.codebook is None else self.codebook
@@ -172,7 +167,8 @@ def doublings_of(stored: Mapping[str, Stored], for_size_one: float) -> Float64s:
     """
     scales, levels = stored["scales"], stored["opacities"]
     factor = scales.entry.step / 3 / math.log(2.0)
-    doublings = scales.row_sums().astype(np.float64) * factor + for_size_one
+    sums = scales.values.sum(1) if scales.codebook is None else scales.codebook.sum(1)[scales.values]
+    doublings: Float64s = sums.astype(np.float64) * factor + for_size_one
     # The logarithm, linear between powers of two.
     mantissas, exponents = np.frexp((np.arange(levels.entry.codes) + 0.5) / levels.entry.codes)
     doublings -= (0.5 * (2 * mantissas - 2 + exponents))[levels.values]
