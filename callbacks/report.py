@@ -14,6 +14,7 @@ from torchmetrics import Metric
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import optional
 from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.errors import Json
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import paper_header, read_nsvq
 from nsvq_lightning.io.nsvq.header import Header
@@ -84,7 +85,7 @@ class MetricReport(WritingCallback):
         super().__post_init__()
         self._scene: CompressedScene | None = None
         self._paper: Header
-        self._scores: list[dict[str, Any]] = []
+        self._scores: list[Json] = []
         self._sampling: Sampling | None = None
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
@@ -152,7 +153,7 @@ class MetricReport(WritingCallback):
                     pictures.write_png(path, torch.cat([eight_bit(photo), image], dim=1))
 
         mean_psnr, mean_ssim = numbers.evaluate(module.scene.render, splats, views, show)
-        entry: dict[str, Any] = {
+        entry: Json = {
             "iteration": iteration,
             "phase": phase.name.lower(),
             "splats": len(module.splats),
@@ -225,7 +226,7 @@ class MetricReport(WritingCallback):
             return
         scores = self._scores
         if trainer.world_size > 1:
-            gathered: list[list[dict[str, Any]]] = [[] for _ in range(trainer.world_size)]
+            gathered: list[list[Json]] = [[] for _ in range(trainer.world_size)]
             torch.distributed.all_gather_object(gathered, scores)
             scores = [score for part in gathered for score in part]
         scores = sorted(scores, key=lambda score: score["name"])

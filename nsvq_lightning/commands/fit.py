@@ -22,6 +22,7 @@ from nsvq_lightning.commands.settings import configs_among, find_config, setting
 from nsvq_lightning.data.colmap import check_name
 from nsvq_lightning.data.datamodule import ColmapDataModule, DemoDataModule
 from nsvq_lightning.io.atomic import optional, write_text
+from nsvq_lightning.io.errors import Json
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import check_settings, read_checkpoint
 from nsvq_lightning.training.run_folder import is_fast_dev_run, reserve, run_folder
@@ -262,7 +263,7 @@ def continuation(checkpoint: Path) -> str:
     return shlex.join([*program, "fit", *options])
 
 
-def summary(folder: Path, metrics: dict[str, Any]) -> str:
+def summary(folder: Path, metrics: Json) -> str:
     """The results of a run, in a few lines."""
     return (
         f"{folder}\n"

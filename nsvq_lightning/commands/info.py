@@ -3,10 +3,10 @@
 import argparse
 import json
 from pathlib import Path
-from typing import Any
 
 from nsvq_lightning.commands import markdown_table, say
 from nsvq_lightning.commands.arguments import folders_beside
+from nsvq_lightning.io.errors import Json
 from nsvq_lightning.io.formats import describe
 
 
@@ -29,7 +29,7 @@ WORDS = ("attribute", "stream", "storage", "encoding")
 CAMERA_FILES = ("cameras.json", "sparse", "transforms.json", "transforms_train.json")
 
 
-def _text(facts: dict[str, Any]) -> str:
+def _text(facts: Json) -> str:
     size, splats = facts["bytes"], max(1, facts["splats"])
     rows = [
         ("file", facts["file"]),

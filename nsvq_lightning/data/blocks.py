@@ -21,6 +21,7 @@ from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.points import projected
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
+from nsvq_lightning.io.errors import Json
 from nsvq_lightning.io.placing import turn_up
 from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.rendering.camera import Camera
@@ -186,7 +187,7 @@ def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path])
     points = scene.points.double().numpy()
     insides = [block.contains(points, 1.0) for block in blocks]
     # Of each part, the train and the test photos, as frames of ``transforms.json``.
-    frames: list[tuple[list[dict[str, Any]], list[dict[str, Any]]]] = [([], []) for _ in blocks]
+    frames: list[tuple[list[Json], list[Json]]] = [([], []) for _ in blocks]
     for index, camera in enumerate(scene.cameras):
         front = points_in_front(points, camera)
         masks = [shown(front, inside, camera) for inside in insides]
@@ -243,7 +244,7 @@ def shown(front: _Front, inside: Bools, camera: Camera) -> Bools:
     return np.asarray(pixels[: camera.height, : camera.width], bool)
 
 
-def _write_photo(folder: Path, index: int, image: Uint8s, mask: Bools, camera: Camera) -> dict[str, Any]:
+def _write_photo(folder: Path, index: int, image: Uint8s, mask: Bools, camera: Camera) -> Json:
     """Write what a photo shows of a part, and its mask; returns its frame in ``transforms.json``."""
     left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
     box = slice(top, top + height), slice(left, left + width)

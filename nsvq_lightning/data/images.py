@@ -5,13 +5,12 @@ from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import PIL.Image
 import torch
-from numpy.typing import NDArray
 from PIL.ExifTags import Base
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
@@ -20,7 +19,7 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.data.colmap import Pinhole, SceneError
 from nsvq_lightning.data.undistortion import Undistortion
-from nsvq_lightning.splats.conventions import Bools, Uint8s
+from nsvq_lightning.splats.conventions import Arrays, Bools, Uint8s
 
 # Pillow refuses twice as many, and by default fewer than phones have.
 PIL.Image.MAX_IMAGE_PIXELS = 1 << 27
@@ -100,7 +99,7 @@ def read_image(path: Path) -> Uint8s:
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
 
 
-def _decoded(path: Path, flags: int) -> NDArray[Any]:
+def _decoded(path: Path, flags: int) -> Arrays:
     """Decode an image as OpenCV does, of 8 or 16 bits, with the pixels as stored: those are what COLMAP works on.
 
     Args:
@@ -133,7 +132,7 @@ def _decoded(path: Path, flags: int) -> NDArray[Any]:
     return _turned_back(image, applied)
 
 
-def _to_bytes(pixels: NDArray[Any]) -> Uint8s:
+def _to_bytes(pixels: Arrays) -> Uint8s:
     """Pixels of 8 or 16 bits in 8."""
     if pixels.dtype != np.uint8:
         pixels = cv2.convertScaleAbs(pixels, alpha=1 / 257)  # rounds; none of the 65536 is near a half
@@ -155,7 +154,7 @@ def _check_whole(data: bytes) -> None:
             raise OSError("there is no end marker")  # OpenCV 4 would fill the missing part with grey
 
 
-def _turned_back(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+def _turned_back(pixels: Arrays, orientation: int) -> Arrays:
     """Pixels to which an EXIF orientation was applied, as they were stored."""
     if orientation >= ON_ITS_SIDE:
         pixels = pixels.swapaxes(0, 1)
@@ -328,7 +327,7 @@ def edges_of(image: Tensor, mask: Tensor | None = None) -> Edges:
     return Edges(values, max(int(values.max()), 1))
 
 
-def high_pass(image: Tensor, mask: Tensor | None, depth: int) -> NDArray[Any]:
+def high_pass(image: Tensor, mask: Tensor | None, depth: int) -> Arrays:
     """Eight times the grey value of each pixel less those of its neighbours, 0 beside pixels that do not count.
 
     Args:
@@ -339,7 +338,7 @@ def high_pass(image: Tensor, mask: Tensor | None, depth: int) -> NDArray[Any]:
     grey = cv2.cvtColor(image.cpu().numpy(), cv2.COLOR_RGB2GRAY)
     kernel = np.full((3, 3), -1, np.float32)
     kernel[1, 1] = 8
-    passed: NDArray[Any] = cv2.filter2D(grey, depth, kernel)
+    passed: Arrays = cv2.filter2D(grey, depth, kernel)
     if mask is not None:
         passed *= cv2.erode(mask.cpu().numpy().view(np.uint8), np.ones((3, 3), np.uint8))
     return passed

@@ -19,6 +19,7 @@ from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, SceneError, che
 from nsvq_lightning.data.images import image_head
 from nsvq_lightning.data.photo_files import locate
 from nsvq_lightning.data.points import cloud_in, read_points, share_seen
+from nsvq_lightning.io.errors import Json
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.poses import viewmat_of
 from nsvq_lightning.splats.conventions import Float64s, Uint8s
@@ -254,7 +255,7 @@ def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> Colm
     )
 
 
-def _frames(file: Path, allow_outside: bool) -> tuple[dict[str, Any], dict[str, _Frame]]:
+def _frames(file: Path, allow_outside: bool) -> tuple[Json, dict[str, _Frame]]:
     """The values of a file, and its frames by the names of their photos.
 
     Raises:

@@ -15,6 +15,7 @@ from torch import Tensor
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.errors import Json
 from nsvq_lightning.io.nsvq.header import Header, read_header
 from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.quality.loss import apply_mask, ssim
@@ -70,7 +71,7 @@ def summarize(
     lpips: tuple[float | None, str | None],
     module: SplatModule,
     paper: Header,
-) -> dict[str, Any]:
+) -> Json:
     """The content of ``metrics.json``; sizes in bytes, PSNR in dB, times in seconds.
 
     Args:
@@ -112,7 +113,7 @@ def write_metrics(path: Path, metrics: Values) -> None:
     write_text(path, json.dumps(finite, indent=2) + "\n")
 
 
-def _codes_in_use(codes: Integers, size: int) -> dict[str, Any]:
+def _codes_in_use(codes: Integers, size: int) -> Json:
     """Rows of the codebook, how many of them are used, and the entropy of the codes, bits each."""
     counts = np.bincount(codes, minlength=size)
     shares = counts[counts > 0] / max(1, len(codes))

@@ -17,6 +17,7 @@ import torch
 from nsvq_lightning.data.points import projected
 from nsvq_lightning.data.scene import Scene, spread
 from nsvq_lightning.io.atomic import StrPath, write_text
+from nsvq_lightning.io.errors import Json
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.rendering.camera import Camera, camera_of
 from nsvq_lightning.rendering.constants import NEAR
@@ -136,7 +137,7 @@ def best_view(splats: SplatTensors, cameras: Sequence[Camera]) -> int:
     return max(range(len(cameras)), key=lambda place: shown(cameras[place]))
 
 
-def camera_entry(camera: Camera) -> dict[str, Any]:
+def camera_entry(camera: Camera) -> Json:
     """A camera as the page's JSON has it.
 
     Returns:
@@ -165,7 +166,7 @@ def page_cameras(path: StrPath) -> dict[str, Camera]:
     cameras = {}
     opengl = torch.tensor([1.0, -1.0, -1.0, 1.0])
     try:
-        scene: dict[str, Any] = json.loads(found[1]) if found else {"cameras": ()}
+        scene: Json = json.loads(found[1]) if found else {"cameras": ()}
         near = float(scene.get("near", NEAR))
         for entry in scene["cameras"]:
             name = str(entry["name"])

@@ -18,6 +18,7 @@ from nsvq_lightning.compute.devices import AsyncScalar, check_can_train, to_devi
 from nsvq_lightning.compute.jit import check_threads
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.errors import Json
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quality.loss import apply_mask, photometric_loss, ssim
 from nsvq_lightning.quality.metrics import eight_bit, psnr
@@ -146,7 +147,7 @@ class SplatModule(LightningModule):
         self.schedule = Schedule()
         self.phase = Phase.WARMUP
         self.active_sh_degree = 0 if splats is None else splats.sh_degree
-        self.history: list[dict[str, Any]] = []
+        self.history: list[Json] = []
         self.stopwatch = Stopwatch()
         self.loss_terms: dict[str, LossTerm] = {"photometric": partial(_photometric_term, self)}
         self.pixel_weights: Tensor | None = None

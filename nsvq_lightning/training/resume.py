@@ -18,7 +18,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
 from nsvq_lightning.data.scene import Scene
-from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.errors import FormatError, Json
 from nsvq_lightning.splats.splats import sh_degree_of
 from nsvq_lightning.training.schedule import Schedule
 
@@ -185,7 +185,7 @@ def _is_harmless(text: str) -> bool:
     return root not in sys.stdlib_module_names and str(getattr(found, "__module__", "")).partition(".")[0] == root
 
 
-def scene_record(scene: Scene) -> dict[str, Any]:
+def scene_record(scene: Scene) -> Json:
     """What a checkpoint remembers of its scene: the folder's name, and a digest of the pose of each view by name.
 
     Neither the size of the photos nor the place of the folder, masks or the choice of test views change it.

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from nsvq_lightning.io.compressed import CompressedScene
@@ -18,7 +17,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.rendering.rasterize import Render, render
 from nsvq_lightning.splats.attributes import QUANTIZABLE, dropped, finite_rows
-from nsvq_lightning.splats.conventions import Float64s
+from nsvq_lightning.splats.conventions import Arrays, Float64s
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, detached, sh_degree_of
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.version import __version__
@@ -135,5 +134,5 @@ def to_compressed(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> Com
     return scene.take(_numpy(finite))
 
 
-def _numpy(tensor: Tensor) -> NDArray[Any]:
+def _numpy(tensor: Tensor) -> Arrays:
     return tensor.detach().cpu().numpy()
