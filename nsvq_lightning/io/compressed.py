@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-ROWS = splat.ROWS
+
+def slices(count: int) -> "Iterator[slice]":
+    """Parts of a table of so many rows, one after another: what is made of one at a time takes little memory."""
+    for start in range(0, count, splat.ROWS):
+        yield slice(start, start + splat.ROWS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,9 +256,8 @@ class CompressedScene:
         return self if np.array_equal(order, np.arange(len(self))) else self.take(order)
 
     def parts(self) -> "Iterator[CompressedScene]":
-        """The scene in parts of splats that follow each other: what is made of one at a time takes little memory."""
-        for start in range(0, max(1, len(self)), ROWS):
-            yield self.take(slice(start, start + ROWS))
+        """The scene in parts of splats that follow each other (:func:`slices`), at least one."""
+        return map(self.take, slices(max(1, len(self))))
 
     def cropped(self, low: Float64s, high: Float64s) -> "CompressedScene":
         """The splats whose centres are in a box, its sides included; codebooks stay as they are.
@@ -312,8 +315,7 @@ class CompressedScene:
             table = next(each for each in (codebooks, bases, raw) if name in each)
             rows = table[name]
             table[name] = np.empty((len(rows), change(rows[:1]).shape[1]), np.float32)
-            for start in range(0, len(rows), ROWS):
-                part = slice(start, start + ROWS)
+            for part in slices(len(rows)):
                 table[name][part] = change(rows[part])
         return replace(self, codebooks=codebooks, raw=raw, bases=bases, stored_bytes=None, **fields)
 

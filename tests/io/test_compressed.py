@@ -84,7 +84,7 @@ def test_parts_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     other = replace(other, means=other.means + 1)
     turned = scene.changed({name: lambda rows: 2.0 * rows[:, ::-1] for name in ("shN", "sh0")})
     errors = attribute_errors(other, scene)
-    monkeypatch.setattr("nsvq_lightning.io.compressed.ROWS", 7)
+    monkeypatch.setattr("nsvq_lightning.splats.attributes.ROWS", 7)
     parts = [*scene.parts()]
     assert [len(part) for part in parts] == [7] * 7 + [1]
     np.testing.assert_array_equal(np.concatenate([part.rows("shN") for part in parts]), scene.rows("shN"))

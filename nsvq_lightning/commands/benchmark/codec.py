@@ -30,7 +30,7 @@ def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Measu
     writers = {".ply": partial(save, splats)}
     writers |= {f".nsvq {level}": partial(save, scene, storage=Storage(level)) for level in LEVELS}
     look = torch.no_grad()(partial(painted, "auto"))
-    truths = {".ply": look(splats, workload), ".nsvq": look(scene.decode().raw(), workload)}
+    truths = {".ply": look(splats, workload), ".nsvq": look(scene.tensors(), workload)}
     writes = {}
     reads: dict[str, Callable[[], object]] = {}
     values = {}

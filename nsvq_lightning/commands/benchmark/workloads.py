@@ -79,12 +79,12 @@ def workloads(scope: Scope) -> list[Workload]:
         return [synthetic_workload(name) for name in scope.workloads]
     name = scope.scene.resolve().name
     if scope.photos is None:
-        splats = detached(read_scene(scope.scene).decode())
+        splats = read_scene(scope.scene).tensors()
         centre, reach = middle_of(splats.means.numpy())
         return [_seen_by(_camera(800, 533, centre, 2 * (reach or 1.0)), splats, name)]
     scene = load_scene(scope.photos)
     if scope.init_from is not None:
-        splats = detached(read_scene(scope.init_from).decode())
+        splats = read_scene(scope.init_from).tensors()
         name += f" {scope.init_from.name}"
     else:
         scene = scene.standard

@@ -12,7 +12,7 @@ import numpy as np
 
 from nsvq_lightning.compute.jit import kernel
 from nsvq_lightning.compute.memory import check_table
-from nsvq_lightning.io.compressed import ROWS, CompressedScene
+from nsvq_lightning.io.compressed import CompressedScene, slices
 from nsvq_lightning.io.morton import Grid
 from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
@@ -132,8 +132,7 @@ def _integers(name: str, rows: Float32s, step: float, limit: float = 2.0**52) ->
         raise ValueError(f"{name}: {largest:.3g} is too large for steps of {step:.3g}; use level 'paper'")
     # Of attributes without a codebook, there are many.
     integers = np.empty(rows.shape, np.int32 if largest / step < SMALL else np.int64)
-    for start in range(0, len(rows), ROWS):
-        part = slice(start, start + ROWS)
+    for part in slices(len(rows)):
         integers[part] = np.rint(rows[part].astype(np.float64) / step)
     return integers
 
