@@ -2,10 +2,9 @@
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -47,7 +46,7 @@ class SplatScene:
     background: str
     antialiased: bool
     backend: str
-    cameras: Float64s = field(default_factory=lambda: np.zeros((0, 4)))
+    cameras: Float64s
 
     def rows(self, attribute: str) -> Tensor:
         """Rows ``[N, D]`` of a quantized attribute, detached."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from splat_scenes import front_camera, random_splats
@@ -29,6 +30,7 @@ def scene_of_splats(**replaced: Any) -> SplatScene:
         "antialiased": False,
         "backend": "auto",
         "sh_degree": 1,
+        "cameras": np.zeros((0, 4)),
     }
     return SplatScene(splats, {}, **settings | replaced)
 
