@@ -265,5 +265,5 @@ def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -
 
     cameras, photos = known_views(path, root, splats.means.detach().cpu().numpy())
     if photos is not None:
-        return list(spread(photos.train_cameras, most))
-    return list(spread(list(cameras.values()), most)) or square_views(splats, most)
+        return spread(photos.train_cameras, most)
+    return spread(list(cameras.values()), most) or square_views(splats, most)

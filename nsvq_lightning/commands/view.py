@@ -161,11 +161,11 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(404, b"there is no such page")
 
     def _scene(self, is_question: bool) -> None:
-        from nsvq_lightning.report import viewer
+        from nsvq_lightning.report.viewer import ask_live, end_live
 
         if is_question and self.live is not None:
             # What was asked of a run that has ended in between is taken back.
-            ask = viewer.end_live if self.file.exists() else viewer.ask_live
+            ask = end_live if self.file.exists() else ask_live
             ask(self.live.parent)
         file = self.live if self.live is not None and self.live.is_file() else self.file
         try:

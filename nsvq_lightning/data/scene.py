@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Literal, TypeVar, get_args
 
 import cv2
 import numpy as np
@@ -34,9 +34,9 @@ T = TypeVar("T")
 Factor = Literal[1, 2, 4, 8]
 
 
-def spread(rows: Any, most: int) -> Any:
+def spread(rows: T, most: int) -> T:
     """At most so many of the rows of a list, an array or a tensor, evenly spread."""
-    return rows[:: max(1, -(-len(rows) // most))]
+    return rows[:: max(1, -(-len(rows) // most))]  # type: ignore[arg-type, index, no-any-return]  # no name for these
 
 
 @dataclass(frozen=True, eq=False)
