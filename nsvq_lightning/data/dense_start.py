@@ -1,4 +1,4 @@
-"""Points where the photos have detail, from the optical flow between neighbouring train photos."""
+"""Points that SfM does not find: where the photos have detail, from the flow between neighbours, and far away."""
 
 import itertools
 import math
@@ -7,12 +7,15 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.images import edges_of, resized
+from nsvq_lightning.data.points import in_picture, projected
 from nsvq_lightning.data.scene import Scene, in_parallel
 from nsvq_lightning.random import draw_rows, generator
+from nsvq_lightning.rendering.frame import EXTENT
 from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Uint8s
 
 # Triangulated pixels: positions ``[M, 3]``, colours ``[M, 3]`` and detail ``[M]``, both in bytes.
@@ -119,13 +122,11 @@ def _photo(scene: Scene, index: int, known: Float64s) -> _Photo:
     camera = scene.cameras[index]
     image, mask = scene.images[index]
     scale = min(1.0, MAX_SIDE / max(camera.size))
-    width = round(camera.width * scale)
-    height = round(camera.height * scale)
+    width, height = (round(side * scale) for side in camera.size)
     pixels, counts = resized(image.numpy(), None if mask is None else mask.numpy(), (width, height))
     edges = edges_of(torch.from_numpy(pixels), None if counts is None else torch.from_numpy(counts))
     view = camera.viewmat.double().numpy()
-    rotation = view[:3, :3]
-    translation = view[:3, 3]
+    rotation, translation = view[:3, :3], view[:3, 3]
     size = np.array([width / camera.width, height / camera.height])
     depths = known @ rotation[2] + translation[2]
     ahead = depths[depths > 0]
@@ -221,3 +222,55 @@ def _followed(a: _Photo, b: _Photo, there: Float32s, back: Float32s, stride: int
         kept &= np.linalg.norm(pixels - expected, axis=1) < MAX_ERROR
     rows, columns = rows[kept], columns[kept]
     return points[kept], a.image[rows, columns], a.detail[rows, columns]
+
+
+# Far points all around for each of the others, and how many times as far away they are as nearly all of these.
+FAR_SHARE = 0.02
+FAR = 2.0
+# Share that is nearly all.
+NEARLY_ALL = 0.95
+# Width in pixels of the square of a photo that a far point has its colour from, and of how many points it is the mean.
+BLUR = 51
+ALIKE = 8
+
+
+def far_points(scene: Scene, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Points evenly on a sphere around a scene and its cameras, in the colours that train photos have there.
+
+    Where few photos look, there may be nothing behind the things that they show. Black then becomes a colour of the
+    scene, and other views see it through the gaps. What no photo shows has the colours next to it. There are none
+    around what was cut out of its photos: where they are transparent, or masks leave less than half of them.
+
+    Args:
+        scene: Its train photos and cameras, in the coordinates of its frame.
+        points: What is known to be there ``[P, 3]``.
+
+    Returns:
+        Positions ``[F, 3]`` and colours ``[F, 3]``, RGB in [0, 1], float32; maybe none.
+
+    Raises:
+        SceneError: An image cannot be decoded.
+    """
+    count = round(FAR_SHARE * len(points))
+    radius = FAR * max(EXTENT, np.nanquantile(points.norm(dim=1).numpy(), NEARLY_ALL))
+    steps = np.arange(count) + 0.5
+    height, turn = 1 - 2 * steps / max(count, 1), math.pi * (1 + math.sqrt(5)) * steps
+    circle = np.sqrt(1 - height**2)
+    places = radius * np.stack([circle * np.cos(turn), circle * np.sin(turn), height], axis=1)
+    sums, photos = np.zeros(places.shape), np.zeros((count, 1))
+    sightings = 0
+    for index in scene.train:
+        (image, mask), camera = scene.images[index], scene.cameras[index]
+        rows = np.flatnonzero(in_picture(places, camera))
+        column, row, _ = projected(places[rows], camera)
+        pixels = row.astype(np.intp), column.astype(np.intp)
+        counts = np.ones((len(rows), 1)) if mask is None else mask.numpy()[pixels][:, None]
+        sums[rows] += counts * cv2.blur(image.numpy(), (BLUR, BLUR))[pixels]
+        photos[rows] += counts
+        sightings += len(rows)
+    if scene.white or photos.sum() <= sightings / 2:
+        return torch.empty(0, 3), torch.empty(0, 3)
+    shown = np.flatnonzero(photos)
+    _, alike = cKDTree(places[shown]).query(places, range(1, min(ALIKE, len(shown)) + 1))
+    colors = (sums[shown] / photos[shown] / 255)[alike].mean(axis=1)
+    return torch.from_numpy(places).float(), torch.from_numpy(colors).float()

@@ -10,7 +10,7 @@ from lightning.pytorch import Trainer
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from nsvq_lightning.data.dense_start import dense_points
+from nsvq_lightning.data.dense_start import dense_points, far_points
 from nsvq_lightning.data.scene import ONE_PLACE, Scene, View, spread
 from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.random import generator
@@ -129,6 +129,7 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
     if count is None:
         return Splats.from_points(scene.points, scene.colors, sh_degree)
     points, colors = _with_dense_points(scene, count - len(scene.points), seed)
+    points, colors = (torch.cat(parts) for parts in zip((points, colors), far_points(scene, points), strict=True))
     splats = Splats.from_points(points, colors, sh_degree, FIRST_OPACITY)
     cameras = scene.train_cameras
     distances, _ = cKDTree([camera.packed_view[12:] for camera in cameras]).query(splats.means.detach())

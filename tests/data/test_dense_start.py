@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from nsvq_lightning.data import dense_start
-from nsvq_lightning.data.dense_start import dense_points
+from nsvq_lightning.data.dense_start import dense_points, far_points
 from nsvq_lightning.data.images import Picture
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.rendering.camera import Camera
@@ -133,3 +134,54 @@ def test_photos_without_neighbours_give_none(places: tuple[float, ...]) -> None:
 def test_photos_without_detail_give_none() -> None:
     points, _ = dense_points(scene_of([wall(x=x, flat=1.0) for x in PLACES]), 1000, seed=0)
     assert len(points) == 0
+
+
+def painted(x: float, color: tuple[int, int, int]) -> Any:
+    """Camera of :func:`wall` and a photo of one colour."""
+    camera, _ = wall(x=x)
+    return camera, Picture(torch.tensor(color, dtype=torch.uint8).expand(camera.height, camera.width, 3), None)
+
+
+@pytest.mark.parametrize(("distance", "radius"), [(3.0, 10.0), (40.0, 80.0)])
+def test_far_points_lie_around_all_others(distance: float, radius: float) -> None:
+    known = torch.tensor([[0.0, 0.0, distance]]).repeat(5000, 1)
+    known[:200] = torch.tensor([[0.0, 1e6, 0.0]])  # a few may be anywhere, or nowhere
+    known[200:210] = torch.nan
+    points, colors = far_points(scene_of([painted(0.0, (51, 102, 204)), painted(0.5, (51, 102, 204))]), known)
+    assert points.shape == colors.shape == (100, 3)
+    torch.testing.assert_close(points.norm(dim=1), torch.full((100,), radius))
+    # Evenly: none is far from the next, and their middle is that of the sphere.
+    next_one = torch.cdist(points, points).fill_diagonal_(torch.inf).min(1).values / radius
+    assert float(next_one.min()) > 0.25
+    assert float(next_one.max()) < 0.4
+    assert float(points.mean(0).norm()) < 0.02 * radius
+
+
+def test_far_points_have_the_colours_that_train_photos_have_there() -> None:
+    views = [painted(0.0, (200, 0, 0)), painted(0.1, (100, 50, 0)), painted(0.2, (0, 0, 255))]
+    points, colors = far_points(scene_of(views, test=(2,)), torch.tensor([[0.0, 0.0, 4.0]]).repeat(50_000, 1))
+    seen = points[:, 2] > 0.95 * 10.0
+    torch.testing.assert_close(colors[seen], torch.tensor([150.0, 25, 0]).div(255).expand(int(seen.sum()), 3))
+    # Those behind the cameras have that of the next ones before them, at the edge of one photo or of both.
+    behind = colors[points[:, 2] < 0]
+    assert len(behind) > 400
+    assert float(behind[:, 0].min()) > 0.39
+    assert float(behind[:, 2].max()) == 0
+
+
+def test_there_are_no_far_points_where_no_photo_looks_and_none_of_few() -> None:
+    views = [painted(0.0, (0, 0, 0))]
+    for count in (10, 100):
+        points, colors = far_points(scene_of(views), torch.tensor([[0.0, 0.0, 4.0]]).repeat(count, 1))
+        assert points.shape == colors.shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("width", "white", "count"), [(256, False, 100), (140, False, 100), (110, False, 0), (256, True, 0)]
+)
+def test_there_are_no_far_points_around_what_was_cut_out(width: int, white: bool, count: int) -> None:
+    camera, picture = painted(0.0, (10, 20, 30))
+    mask = (torch.arange(camera.width) < width).expand(camera.height, -1)
+    scene = replace(scene_of([(camera, Picture(picture.image, mask))]), white=white)
+    points, _ = far_points(scene, torch.tensor([[0.0, 0.0, 4.0]]).repeat(50 * 100, 1))
+    assert len(points) == count

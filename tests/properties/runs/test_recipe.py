@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
 from typing import Any
 
@@ -114,8 +115,10 @@ def test_a_dense_start_adds_points_to_those_of_sfm(
     with caplog.at_level(logging.INFO):
         known, more = splats(0.0), splats(0.8)
     (line,) = [message for message in caplog.messages if "points beside" in message]
-    assert line.startswith(f"dense start: {8000 - known} points beside {known} of SfM, ")
-    assert more == 8000
+    dense, sfm = map(int, re.findall(r"dense start: (\d+) points beside (\d+) of SfM, ", line)[0])
+    assert dense + sfm == 8000
+    # Those far away come on top.
+    assert (known, more) == (sfm + round(0.02 * sfm), 8160)
 
 
 def test_where_flow_finds_nothing_the_run_starts_from_sfm(
