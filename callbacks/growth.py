@@ -53,7 +53,8 @@ class SplatBudget(SplatCallback):
     """Size of the file at level ``compact``."""
     start: NonNegative = 0.8
     """Points to start with, as a share of the number of splats: those of SfM, and as many more as that takes from the
-    flow between photos (:func:`nsvq_lightning.data.dense_start.dense_points`); 0 for those of SfM."""
+    flow between photos (:func:`nsvq_lightning.data.dense_start.dense_points`); 0 for those of SfM. A fiftieth more lies
+    far around them (:func:`~nsvq_lightning.data.dense_start.far_points`)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -117,8 +117,8 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
     Args:
         trainer: The trainer.
         sh_degree: Of the splats, whose higher coefficients are 0.
-        count: How many points, of SfM and, where these are fewer, of :mod:`nsvq_lightning.data.dense_start`; None for
-            those of SfM, as in 3DGS.
+        count: How many points, of SfM and, where these are fewer, of the flow between photos; far ones come on top
+            (:mod:`nsvq_lightning.data.dense_start`). None for those of SfM alone, as in 3DGS.
         seed: Of the dense start.
 
     Raises:
