@@ -13,7 +13,7 @@ from torch import Tensor
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.images import edges_of, resized
 from nsvq_lightning.data.points import in_picture, projected
-from nsvq_lightning.data.scene import Scene, in_parallel
+from nsvq_lightning.data.scene import Scene, in_parallel, spread
 from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.rendering.frame import EXTENT
 from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Uint8s
@@ -229,7 +229,9 @@ FAR_SHARE = 0.02
 FAR = 2.0
 # Share that is nearly all.
 NEARLY_ALL = 0.95
-# Width in pixels of the square of a photo that a far point has its colour from, and of how many points it is the mean.
+# Most photos that colours are taken from; width in pixels of the square around a far point whose mean it is in a photo;
+# and of how many neighbouring points it is the mean then.
+COLORED_BY = 256
 BLUR = 51
 ALIKE = 8
 
@@ -259,7 +261,7 @@ def far_points(scene: Scene, points: Tensor) -> tuple[Tensor, Tensor]:
     places = radius * np.stack([circle * np.cos(turn), circle * np.sin(turn), height], axis=1)
     sums, photos = np.zeros(places.shape), np.zeros((count, 1))
     sightings = 0
-    for index in scene.train:
+    for index in spread(scene.train, COLORED_BY):
         (image, mask), camera = scene.images[index], scene.cameras[index]
         rows = np.flatnonzero(in_picture(places, camera))
         column, row, _ = projected(places[rows], camera)

@@ -143,10 +143,9 @@ def _with_dense_points(scene: Scene, missing: int, seed: int) -> tuple[Tensor, T
     if missing <= 0:
         return scene.points, scene.colors
     log.info("dense start: looking for %d points that neighbouring photos show, beside those of SfM", missing)
-    start = time.perf_counter()
+    start, known = time.perf_counter(), len(scene.points)
     points, colors = dense_points(scene, missing, seed)
-    seconds = time.perf_counter() - start
-    log.info("dense start: %d points beside %d of SfM, %.1f s", len(points), len(scene.points), seconds)
+    log.info("dense start: %d points beside %d of SfM, %.1f s", len(points), known, time.perf_counter() - start)
     if len(points) == 0:
         log.warning("neighbouring photos show nothing that could be followed: training starts from SfM's points")
     return torch.cat([scene.points, points]), torch.cat([scene.colors, colors])
