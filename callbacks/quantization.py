@@ -286,7 +286,7 @@ class RateDistortion(SplatCallback):
 
     state = ("prices",)
 
-    strength: Positive = 4.0
+    strength: Positive = 2.0
     """Per cent of squared error worth one per cent of the file."""
     # What a bit costs each splat ``[N]`` in squared error, by attribute.
     prices: dict[str, Tensor] | None = field(default=None, init=False)
