@@ -103,15 +103,12 @@ def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
         yield made
 
 
-# As many as the page of a run has.
-MAX_CAMERAS = 300
-
-
 def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     """Cameras of the photos, or guessed ones."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.data.scene import spread
     from nsvq_lightning.io.formats import load
+    from nsvq_lightning.report.viewer import MAX_CAMERAS
 
     # What a run has recorded are its own, and need no look at the scene.
     is_own = options.root is None and (options.scene / "viewer.html").is_file()

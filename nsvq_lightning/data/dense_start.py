@@ -253,15 +253,14 @@ def far_points(scene: Scene, points: Tensor) -> tuple[Tensor, Tensor]:
     Raises:
         SceneError: An image cannot be decoded.
     """
-    count = round(FAR_SHARE * len(points))
+    count = 0 if scene.white else round(FAR_SHARE * len(points))
     radius = FAR * max(EXTENT, np.nanquantile(points.norm(dim=1).numpy(), NEARLY_ALL))
     steps = np.arange(count) + 0.5
     height, turn = 1 - 2 * steps / max(count, 1), math.pi * (1 + math.sqrt(5)) * steps
     circle = np.sqrt(1 - height**2)
     places = radius * np.stack([circle * np.cos(turn), circle * np.sin(turn), height], axis=1)
-    sums, photos = np.zeros(places.shape), np.zeros((count, 1))
-    sightings = 0
-    for index in spread(scene.train, COLORED_BY):
+    sums, photos, sightings = np.zeros(places.shape), np.zeros((count, 1)), 0
+    for index in spread(scene.train, COLORED_BY) if count else ():
         (image, mask), camera = scene.images[index], scene.cameras[index]
         rows = np.flatnonzero(in_picture(places, camera))
         column, row, _ = projected(places[rows], camera)
@@ -270,7 +269,7 @@ def far_points(scene: Scene, points: Tensor) -> tuple[Tensor, Tensor]:
         sums[rows] += counts * cv2.blur(image.numpy(), (BLUR, BLUR))[pixels]
         photos[rows] += counts
         sightings += len(rows)
-    if scene.white or photos.sum() <= sightings / 2:
+    if photos.sum() <= sightings / 2:
         return torch.empty(0, 3), torch.empty(0, 3)
     shown = np.flatnonzero(photos)
     _, alike = cKDTree(places[shown]).query(places, range(1, min(ALIKE, len(shown)) + 1))

@@ -30,9 +30,13 @@ _LENS = ("fx", "fy", "cx", "cy")
 REQUEST = "live.request"
 
 
+# Most cameras of a page.
+MAX_CAMERAS = 300
+
+
 def some_cameras(scene: Scene) -> dict[str, Camera]:
-    """Cameras of at most 300 photos by name, evenly spaced."""
-    return dict(spread(list(zip(scene.names, scene.cameras, strict=True)), 300))
+    """Cameras of at most :data:`MAX_CAMERAS` photos by name, evenly spaced."""
+    return dict(spread(list(zip(scene.names, scene.cameras, strict=True)), MAX_CAMERAS))
 
 
 # RGB of the backgrounds that have names.
