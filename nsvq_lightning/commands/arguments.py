@@ -231,21 +231,30 @@ def trained_scene(path: Path, root: Path | None) -> "CompressedScene":
         FormatError: The scene is damaged.
     """
     from nsvq_lightning.io.formats import read_scene
-    from nsvq_lightning.rendering.sampling import trained_by
 
     scene = read_scene(path)
-    if len(scene.cameras):
-        return scene
-    cameras = []
+    return scene if len(scene.cameras) else scene_with_views(scene, path, root)[0]
+
+
+def scene_with_views(
+    scene: "CompressedScene", path: Path, root: Path | None
+) -> "tuple[CompressedScene, list[Camera], Scene | None]":
+    """A scene as of :func:`trained_scene`, once it is read; cameras that show it, and their photos, as far as known."""
+    from nsvq_lightning.rendering.sampling import trained_by
+
+    cameras: list[Camera] = []
+    photos = None
     try:
-        cameras = list(cameras_of(path, root, scene.means).values())
+        known, photos = known_views(path, root, scene.means)
+        cameras = list(known.values())
     except (ValueError, OSError) as error:
         if root is not None:
             raise
         log.warning("%s: the cameras of its training cannot be read (%s)", path, error)
-    if cameras:
+    if cameras and not len(scene.cameras):
         log.info("%s: blur and size are those of %d cameras that it was trained by", path, len(cameras))
-    return replace(scene, cameras=trained_by(cameras))
+        scene = replace(scene, cameras=trained_by(cameras))
+    return scene, cameras, photos
 
 
 def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -> "list[Camera]":

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import add_root, known_views, positive, trained_scene
+from nsvq_lightning.commands.arguments import add_root, positive, scene_with_views
 from nsvq_lightning.io.atomic import make_folder_of, write_bytes
 from nsvq_lightning.io.formats import FORMATS
 from nsvq_lightning.io.lod import NAME
@@ -95,7 +95,7 @@ def run(options: argparse.Namespace) -> int:
         ValueError: The scene cannot be used, or a limit cannot be met.
         OSError: A file cannot be read or written.
     """
-    from nsvq_lightning.io.formats import suffix_of
+    from nsvq_lightning.io.formats import read_scene, suffix_of
 
     streamed = suffix_of(options.output) == NAME
     wrong = ""
@@ -107,14 +107,12 @@ def run(options: argparse.Namespace) -> int:
         wrong = f"--levels is for {NAME}, but the output is {options.output}"
     if wrong:
         raise argparse.ArgumentError(None, wrong)
-    scene = trained_scene(options.input, options.root)
+    scene, cameras, photos = scene_with_views(read_scene(options.input), options.input, options.root)
     most = splats_left(options.splats, len(scene))
     from nsvq_lightning.compression.compressor import Compressor
 
-    cameras, photos = known_views(options.input, options.root, scene.means)
-    given = [] if photos else list(cameras.values())
-    storage = Storage(options.level)
-    compressor = Compressor(scene, given, photos, storage, options.seed, options.minutes, options.steps)
+    given = [] if photos else cameras
+    compressor = Compressor(scene, given, photos, Storage(options.level), options.seed, options.minutes, options.steps)
     if streamed:
         _write_levels(options, compressor, most)
     else:

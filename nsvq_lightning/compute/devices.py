@@ -40,6 +40,7 @@ def _kernels_of(device: str) -> Literal["cpu", "cuda"] | None:
     return "cuda" if device == "cuda" and _has_triton() else None
 
 
+@cache
 def best_device() -> torch.device:
     """The fastest device that has kernels here: CUDA where Triton is installed, else the CPU.
 

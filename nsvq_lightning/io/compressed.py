@@ -267,8 +267,7 @@ class CompressedScene:
             high: Largest ``[3]``.
         """
         positions = self.means + np.array(self.origin)
-        inside = (positions >= low) & (positions <= high)
-        return self.take(inside.all(1))
+        return self.take(((positions >= low) & (positions <= high)).all(1))
 
     def finite_rows(self) -> tuple[Bools, dict[str, int]]:
         """Which splats ``[N]`` have neither NaN nor infinite values, and how many do, by attribute."""

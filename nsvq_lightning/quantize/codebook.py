@@ -20,8 +20,7 @@ def copy_codes(active: Tensor, count: int, generator: torch.Generator) -> Tensor
     None is picked twice before all have been picked once. In float32 the noise rarely changes a value, so a copy gets
     rows only once training has moved it.
     """
-    rounds = -(-count // len(active))
-    order = [shuffled(active, generator) for _ in range(rounds)]
+    order = [shuffled(active, generator) for _ in range(-(-count // len(active)))]
     noise = torch.randn(count, active.shape[1], generator=generator, device=generator.device)
     return active[torch.cat(order)[:count]] + 1e-12 * noise.to(active)
 

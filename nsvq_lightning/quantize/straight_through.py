@@ -68,8 +68,7 @@ class PostHoc(CodebookQuantizer):
         """In training, the rows ``[V, D]`` themselves, and -1 as the code of each; otherwise hard codes."""
         if self.frozen or not self.training:
             return super().forward(x, generator, rows)
-        count = len(x) if rows is None else len(rows)
-        codes = x.new_full((count,), -1, dtype=torch.int64)
+        codes = x.new_full((len(x if rows is None else rows),), -1, dtype=torch.int64)
         return self.approximate(x, codes, generator, rows), codes
 
     def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator | None, rows: Tensor | None) -> Tensor:

@@ -78,8 +78,7 @@ def as_bytes(image: Tensor) -> Uint8s:
 
 def write_png(path: Path, image: Tensor) -> None:
     """Write an RGB image ``[H, W, 3]`` in [0, 1] as 8-bit PNG, atomically."""
-    bgr = cv2.cvtColor(as_bytes(image), cv2.COLOR_RGB2BGR)
-    write_bytes(path, cv2.imencode(".png", bgr)[1].tobytes())
+    write_bytes(path, cv2.imencode(".png", cv2.cvtColor(as_bytes(image), cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
 def log_pictures(loggers: Sequence[Logger], pictures: Sequence[Path], step: int) -> None:

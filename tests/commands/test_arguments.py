@@ -20,6 +20,7 @@ from nsvq_lightning.commands.arguments import (
     photos_of,
     positive,
     scene_file,
+    scene_with_views,
     some_of,
     trained_scene,
     unknown_option,
@@ -125,6 +126,10 @@ def test_a_scene_has_the_cameras_that_lie_beside_it(
     kept = tmp_path / "scene.nsvq"
     save(replace(read_scene(path), cameras=np.array([[1.0, 2, 3, 9]])), kept)
     assert trained_scene(kept, demo_scene).cameras.tolist() == [[1, 2, 3, 9]]  # its own
+    scene, cameras, photos = scene_with_views(read_scene(kept), kept, demo_scene)
+    assert scene.cameras.tolist() == [[1, 2, 3, 9]]
+    assert photos is not None
+    assert len(cameras) == len(photos)
 
 
 @pytest.mark.parametrize(("settings", "width"), [("factor: 4", 24), ("max_width: 48", 48), ("seed: 0", 96)])

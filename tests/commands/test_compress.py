@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -62,7 +63,9 @@ def test_photos_are_trained_on(tmp_path: Path, demo_scene: Path, capsys: pytest.
     splats = Splats.from_points(photos.points, photos.colors, opacity=0.9)
     command = ["compress", str(source), str(output), "--codebooks=0.5k", "--steps=3", f"--data.root={demo_scene}"]
     save(splats, source)
-    assert main(command) == 0
+    with patch("nsvq_lightning.data.scene.load_scene", wraps=load_scene) as loading:
+        assert main(command) == 0
+    assert loading.call_count == 1
     assert len(read_nsvq(output)) == len(photos.points)
     assert f"fitted to the photos of {demo_scene}" in capsys.readouterr().out
     save(detached(splats)._replace(sh0=-4 * splats.sh0), source)

@@ -17,6 +17,7 @@ from lightning.pytorch.trainer.connectors import accelerator_connector
 
 from nsvq_lightning.compute import devices
 from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.training import trainer
 from nsvq_lightning.training.distributed import ViewParallelStrategy, check_strategy
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.trainer import SplatTrainer
@@ -54,6 +55,7 @@ def test_a_gpu_without_kernels_is_left_alone(
     monkeypatch.setattr(accelerator, "setup_device", lambda *_: None)
     monkeypatch.setattr(devices, "_has_triton", lambda: False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: accelerator is CUDAAccelerator)
+    monkeypatch.setattr(trainer, "best_device", devices.best_device.__wrapped__)
     monkeypatch.setattr(accelerator_connector, "_select_auto_accelerator", lambda: name)
     settings: dict[str, Any] = {"max_steps": 2, "enable_checkpointing": False, "default_root_dir": tmp_path}
     assert SplatTrainer(**settings).strategy.root_device.type == "cpu"
