@@ -42,7 +42,7 @@ def _kernels_of(device: str) -> Literal["cpu", "cuda"] | None:
 
 @cache
 def best_device() -> torch.device:
-    """The fastest device that has kernels here: CUDA where Triton is installed, else the CPU.
+    """The fastest device that has kernels here, looked for once: CUDA where Triton is installed, else the CPU.
 
     Lightning's own choice may be one without any, Apple's MPS or, on Windows, CUDA: plain torch is slower than the CPU.
     """
