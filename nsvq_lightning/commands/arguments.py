@@ -239,7 +239,19 @@ def trained_scene(path: Path, root: Path | None) -> "CompressedScene":
 def scene_with_views(
     scene: "CompressedScene", path: Path, root: Path | None
 ) -> "tuple[CompressedScene, list[Camera], Scene | None]":
-    """A scene as of :func:`trained_scene`, once it is read; cameras that show it, and their photos, as far as known."""
+    """A scene that was read, as :func:`trained_scene` gives it, and what is known of its photos, looked for once.
+
+    Args:
+        scene: The scene; cameras of its own stay.
+        path: Its file.
+        root: Folder with the cameras of the photos that it was trained on.
+
+    Returns:
+        The scene, the cameras that show it, and the photos; no cameras and None for what is not known.
+
+    Raises:
+        ValueError: The folder ``root`` is not a scene. What is damaged beside the file is a warning.
+    """
     from nsvq_lightning.rendering.sampling import trained_by
 
     cameras: list[Camera] = []
