@@ -147,10 +147,8 @@ class CodebookReplacement(SplatCallback):
     """Interval of the late series."""
     jitter: Factor | None = 0.5
     """None copies random active codes, as in the paper. A number in (0, 1] splits the codes that distort most: a row of
-    the scene is drawn with probability proportional to its squared distance to its code, and the new code is put this
-    share of the way from that code to the row."""
-    reset_moments: bool = True
-    """Zero Adam's moments of replaced codes, instead of keeping the old ones."""
+    the scene is drawn with probability proportional to its squared distance to its code, the new code is put this share
+    of the way from that code to the row, and Adam's moments of it begin anew."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -178,9 +176,8 @@ class CodebookReplacement(SplatCallback):
                 replaced = quantizer.replace_unused(draws)
             else:
                 replaced = quantizer.replace_unused(draws, rows=module.scene.rows(name), jitter=self.jitter)
-            values[f"codebook/{name}_replaced"] = float(len(replaced))
-            if self.reset_moments:
                 row_ops.reset_moments(trainer.optimizers[0], optim.codebook_group(name), replaced)
+            values[f"codebook/{name}_replaced"] = float(len(replaced))
             log.debug("iteration %d: replaced %d codes of %s", iteration, len(replaced), name)
         distributed.check_replicas(trainer, "the replacement of codes")
         module.log_dict(values, batch_size=1)

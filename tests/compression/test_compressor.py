@@ -116,14 +116,14 @@ def test_the_smallest_file_within_an_error(small: Compressor) -> None:
 
 def test_more_bytes_never_cost_quality() -> None:
     """From codebooks to a basis to everything as it is; each view that counts was not trained on."""
-    small = compressor(ball(400), steps=40, views=10)
+    small = compressor(ball(1000), steps=20, views=10)
     assert not set(small.data.scene.test) & set(small.data.scene.train)
-    sizes = [len(small.at(setting).data) for setting in (Setting(400, "0.5k"), Setting(400, "none"))]
-    found = [small.finest_within(int(target), 400) for target in np.linspace(sizes[0], 1.1 * sizes[1], 8)]
+    sizes = [len(small.at(setting).data) for setting in (Setting(1000, "0.5k"), Setting(1000, "none"))]
+    found = [small.finest_within(int(target), 1000) for target in np.linspace(sizes[0], 1.1 * sizes[1], 8)]
     qualities = [small.quality(candidate) for candidate in found]
     assert all(later > max(qualities[: k + 1]) - 0.05 for k, later in enumerate(qualities[1:]))  # dB
     assert len({candidate.setting for candidate in found}) > 3
-    assert found[-1].setting == Setting(400, "none")
+    assert found[-1].setting == Setting(1000, "none")
 
 
 def test_a_basis_needs_no_room_for_codebooks() -> None:

@@ -21,9 +21,10 @@ def unframe(data):
     assert len(data) >= 32
     assert hashlib.blake2b(data[24:], digest_size=16).digest() == data[8:24]
     version, length = struct.unpack_from("<II", data, 24)
-    assert version in (2, 3)
+    assert version in (2, 3, 4)
     assert 32 + length <= len(data)
     header = json.loads(data[32 : 32 + length].decode("utf-8"), parse_constant=refuse)
+    header["version"] = version
     streams, at = {}, 32 + length
     for name, size, _ in header["streams"]:
         streams[name] = data[at : at + size]
@@ -154,6 +155,22 @@ def decode_paper(header, streams):
 RATES = [(1310720 + 10 * n + 16) // (20 * n + 32) for n in range(127)]
 
 
+def state_of(states, context, contexts):
+    return states.get(context, (32768, 0 if len(contexts) == 1 else 2))
+
+
+def probability(states, contexts):
+    """Of a 1, in units of 1/65536, by one context or two."""
+    return sum(state_of(states, context, contexts)[0] for context in contexts) // len(contexts)
+
+
+def learn(states, contexts, bit):
+    for context, limit in zip(contexts, (126,) if len(contexts) == 1 else (60, 6), strict=True):
+        p, n = state_of(states, context, contexts)
+        target = 65488 if bit else 48
+        states[context] = p + (((target - p) * RATES[n]) >> 16), min(n + 1, limit)
+
+
 class RangeDecoder:
     def __init__(self, data):
         assert len(data) % 4 == 0
@@ -173,15 +190,13 @@ class RangeDecoder:
             self.width <<= 32
             self.code = ((self.code << 32) | self.word()) & (2**64 - 1)
 
-    def bit(self, context):
-        p, n = self.states.get(context, (32768, 0))
-        part = (self.width >> 16) * p
+    def bit(self, *contexts):
+        part = (self.width >> 16) * probability(self.states, contexts)
         if self.code < part:
             bit, self.width = 1, part
         else:
             bit, self.code, self.width = 0, self.code - part, self.width - part
-        target = 65488 if bit else 48
-        self.states[context] = p + (((target - p) * RATES[n]) >> 16), min(n + 1, 126)
+        learn(self.states, contexts, bit)
         self.refill()
         return bit
 
@@ -217,8 +232,8 @@ def leaf_paths(count):
     return paths
 
 
-def decode_paths(data, count, neighbours):
-    """Leaf of each row; count is K, and neighbours [N] holds pairs of rows, -1 for none."""
+def decode_paths(data, count, neighbours, two=True):
+    """Leaf of each row; count is K, neighbours [N] holds pairs of rows, -1 for none; two from version 4 on."""
     decoder, bits = RangeDecoder(data), (count - 1).bit_length()
     plain, paths = max(0, bits - 16), []
     for first, second in neighbours:
@@ -227,7 +242,8 @@ def decode_paths(data, count, neighbours):
         for left in range(bits - 1, plain - 1, -1):  # how many decisions come after this one
             said = [1 + ((other >> left) & 1) if other >> (left + 1) == path else 0 for other in others]
             node = (1 << (bits - 1 - left)) + path
-            path = 2 * path + decoder.bit(9 * node + 3 * said[0] + said[1])
+            contexts = [(node, *said), node] if two else [(node, *said)]
+            path = 2 * path + decoder.bit(*contexts)
         paths.append((path << plain) + decoder.plain(plain))
     decoder.end()
     leaf_of = {path: leaf for leaf, path in enumerate(leaf_paths(count))}
@@ -244,17 +260,23 @@ def read_length(decoder, context):
 
 def decode_integers(data, rows, columns):
     assert len(data) >= columns
+    assert all(mode < 4 for mode in data[:columns])
     decoder = RangeDecoder(data[columns:])
     values = np.zeros((rows, columns), np.int64)
     for i in range(rows):
         for j in range(columns):
             length = read_length(decoder, ("length", j))
+            assert length <= 53
             negative = decoder.plain(1) if length > 0 else 0
             size = min(length, 1)
             if length > 1:
                 size = 2 + decoder.bit(("second", j, length))
                 size = (size << (length - 2)) + decoder.plain(length - 2)
-            value = (-size if negative else size) + (int(values[i - 1, j]) if data[j] and i else 0)
+            value, by_rows, by_columns = -size if negative else size, data[j] & 1 and i > 0, data[j] & 2 and j > 0
+            if by_columns:
+                value += int(values[i, j - 1])
+            if by_rows:
+                value += int(values[i - 1, j]) - (int(values[i - 1, j - 1]) if by_columns else 0)
             assert abs(value) < 2**52
             values[i, j] = value
     decoder.end()
@@ -327,7 +349,7 @@ def values_of(integers, step):
 
 
 def decode_compact(header, streams):
-    table, count = attribute_table(header), header["splats"]
+    table, count, two = attribute_table(header), header["splats"], header["version"] > 3
     leaves, integers, rows = {}, {}, {}
 
     def decode(name, neighbours):
@@ -341,7 +363,7 @@ def decode_compact(header, streams):
             assert all((np.abs(values) < 2**23).all() for values in (basis, coefficients))
             integers[name] = coefficients @ basis
             return
-        leaves[name] = decode_paths(streams[name], entry["codes"], neighbours)
+        leaves[name] = decode_paths(streams[name], entry["codes"], neighbours, two)
         if entry["storage"] == "codes":
             codebook = decode_integers(streams[f"{name}.codebook"], entry["codes"], entry["dim"])
             integers[name] = codebook[leaves[name]]
@@ -404,15 +426,13 @@ class RangeEncoder:
             self.low = (self.low << 32) & (2**64 - 1)
             self.width <<= 32
 
-    def bit(self, context, bit):
-        p, n = self.states.get(context, (32768, 0))
-        part = (self.width >> 16) * p
+    def bit(self, bit, *contexts):
+        part = (self.width >> 16) * probability(self.states, contexts)
         if bit:
             self.width = part
         else:
             self.low, self.width = self.low + part, self.width - part
-        target = 65488 if bit else 48
-        self.states[context] = p + (((target - p) * RATES[n]) >> 16), min(n + 1, 126)
+        learn(self.states, contexts, bit)
         self.flush()
 
     def plain(self, value, bits):

@@ -64,8 +64,8 @@ def _render_rows(workload: Workload, scope: Scope, device: str) -> Iterator[Meas
 
     def timed(where: Workload, painters: dict[str, Painter]) -> Iterator[Measurement]:
         leaves = RawSplats(*(tensor.clone().requires_grad_() for tensor in where.splats))
-        for operation, call in ((FORWARD, _forward), (BOTH, _both)):
-            cases = {name: partial(call, paint, where, leaves) for name, paint in painters.items()}
+        for operation in (FORWARD, BOTH):
+            cases = {name: partial(_run, paint, where, leaves, operation) for name, paint in painters.items()}
             values = {name: errors[name][operation] for name in painters}
             yield from compare(operation, str(where), cases, values, scope, device)
 
@@ -74,13 +74,11 @@ def _render_rows(workload: Workload, scope: Scope, device: str) -> Iterator[Meas
     yield from timed(crop, every)
 
 
-@torch.no_grad()
-def _forward(paint: Painter, workload: Workload, leaves: RawSplats) -> None:
-    paint(leaves, workload)
-
-
-def _both(paint: Painter, workload: Workload, leaves: RawSplats) -> None:
-    torch.autograd.grad(paint(leaves, workload), leaves, workload.image_gradient)
+def _run(paint: Painter, workload: Workload, leaves: RawSplats, operation: str) -> None:
+    with torch.set_grad_enabled(operation == BOTH):
+        image = paint(leaves, workload)
+    if operation == BOTH:
+        torch.autograd.grad(image, leaves, workload.image_gradient)
 
 
 def errors_of(crop: Workload, paint: Painter, truth: Traced) -> dict[str, dict[str, float]]:

@@ -19,6 +19,7 @@ import math
 import struct
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import torch
@@ -65,9 +66,8 @@ def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header
         ValueError: A value is too large for its step.
     """
     with _workers() as pool:
-        along = morton.spatial_order(scene.means)
         names = (*_EARLY, *_LONGEST_FIRST)
-        tasks = {name: pool.submit(rounded, scene, name, precision, along) for name in names}
+        tasks = {name: pool.submit(rounded, scene, name, precision) for name in names}
         early = {name: tasks[name].result() for name in _EARLY}
         grid, doublings, depths = position_grid(scene.means, early, precision)
         cells, inside = grid.cells(scene.means)
@@ -108,12 +108,13 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
     grid = morton.Grid(entries["means"].step, tuple(base))
     far = np.frombuffer(streams["means.far"], "<f4").astype(np.float32).reshape(-1, 3)
     with _workers() as pool:
-        early = {name: pool.submit(_decoded, entries[name], streams, _before(header.splats)) for name in _EARLY}
+        decode = partial(_decoded, streams=streams, two=header.version > 3)
+        early = {name: pool.submit(decode, entries[name], near=_before(header.splats)) for name in _EARLY}
         stored = {name: early[name].result() for name in _EARLY}
         depths = grid.depths(doublings_of(stored, doublings))[: header.splats - len(far)]
         keys = entropy.decode_keys(streams["means"], 3 * depths)
         neighbours = _neighbours(keys, depths, header.splats)
-        late = {name: pool.submit(_decoded, entries[name], streams, neighbours) for name in _LONGEST_FIRST}
+        late = {name: pool.submit(decode, entries[name], near=neighbours) for name in _LONGEST_FIRST}
         means = np.concatenate([grid.centers(morton.unmorton(keys), depths), far])
         stored |= {name: late[name].result() for name in _LATE}
     levels = stored.pop("opacities")
@@ -172,8 +173,8 @@ def _encoded(attribute: Stored, order: Int64s, neighbours: Int32s) -> dict[str, 
     return streams
 
 
-def _decoded(entry: AttributeEntry, streams: Mapping[str, memoryview], near: Int32s) -> Stored:
-    """Invert :func:`_encoded`."""
+def _decoded(entry: AttributeEntry, streams: Mapping[str, memoryview], near: Int32s, two: bool) -> Stored:
+    """Invert :func:`_encoded`, for decisions of one context or two."""
     own = streams[entry.name]
     codebook = None
     if entry.storage in _TABLES:
@@ -181,7 +182,7 @@ def _decoded(entry: AttributeEntry, streams: Mapping[str, memoryview], near: Int
     if _STREAMS[entry.storage][""] == "paths":
         leaf_of = np.full(1 << entry.bits, -1)
         leaf_of[leaf_paths(entry.codes)] = np.arange(entry.codes)
-        values = leaf_of[entropy.decode_paths(own, entry.bits, near)]
+        values = leaf_of[entropy.decode_paths(own, entry.bits, near, two)]
         if (values < 0).any():
             raise FormatError(f"damaged: a code of {entry.name} is not one of {entry.codes}")
     else:

@@ -14,7 +14,7 @@ from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array, out
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.morton import check_depths
 from nsvq_lightning.io.nsvq import range_coder as rc
-from nsvq_lightning.splats.conventions import Bools, Int32s, Int64s, Integers, Uint32s, Uint64s
+from nsvq_lightning.splats.conventions import Int32s, Int64s, Integers, Uint32s, Uint64s
 
 # Bits of a key; the highest is bit 62.
 KEY_BITS = 63
@@ -28,6 +28,8 @@ _RELATIONS = 9
 _START = uint64(0xFFFFFFFFFFFFFFFF)
 # Integers are below it in size: they and their sums are exact in float64.
 _TOO_LARGE = 1 << 52
+# Bits of a difference of two of them, at most.
+_LONGEST = 53
 _KEY_MASK = uint64((1 << KEY_BITS) - 1)
 # What a reader returns instead of the number of words when it meets a value out of range.
 _OUTSIDE = -1
@@ -38,6 +40,8 @@ _BEFORE = 11
 _KEY_CONTEXTS = (KEY_BITS + 1) * _BEFORE << _LENGTH_BITS
 # Contexts per column: the tree of the lengths, and the second bit by length.
 _INTEGER_CONTEXTS = 2 << _LENGTH_BITS
+# How a column of integers is written: 1 for differences from row to row, plus 2 for those from column to column.
+_MODES = 4
 # Whoever calls one gives it all the memory that it needs.
 _stream_kernel = partial(kernel, allocates=False)
 
@@ -45,7 +49,8 @@ _stream_kernel = partial(kernel, allocates=False)
 def encode_paths(paths: Int64s, bits: int, neighbours: Int32s) -> bytes:
     """Bytes of paths ``[N]`` of ``bits`` decisions each, the first one in the highest bit.
 
-    A decision's context is the node of the tree where it is taken, and the branches that two earlier paths took there.
+    A decision has two contexts: the node of the tree where it is taken, which follows what changes along the paths,
+    and that with the branches which two earlier paths took there.
 
     Args:
         paths: The paths, in [0, 2^bits).
@@ -57,32 +62,38 @@ def encode_paths(paths: Int64s, bits: int, neighbours: Int32s) -> bytes:
         TypeError: A dtype is wrong.
     """
     check_array("paths", paths, (len(neighbours),), INT64)
-    contexts = _path_contexts(bits, neighbours)
+    contexts = _path_contexts(bits, neighbours, True)
     words = _room(len(paths) * bits)
     return _bytes(words, _write_paths(paths, bits, neighbours, words, contexts))
 
 
-def _path_contexts(bits: int, neighbours: Int32s) -> Uint32s:
-    """New contexts for the decisions of paths; refuses what no path may have."""
+def _path_contexts(bits: int, neighbours: Int32s, two: bool) -> Uint32s:
+    """New contexts for the decisions of paths, one or two of each; refuses what no path may have."""
     if not 0 <= bits <= 32:
         raise ValueError(f"a path must have 0 to 32 bits, got {bits}")
     check_array("neighbours", neighbours, (len(neighbours), 2), INT32)
     if neighbours.size and (neighbours.min() < -1 or neighbours.max() >= len(neighbours)):
         raise ValueError(f"neighbours must be in [-1, {len(neighbours)}), got {neighbours.min()} to {neighbours.max()}")
-    return rc.new_contexts(_RELATIONS << min(bits, _MODELLED_BITS))
+    return rc.new_contexts((_RELATIONS + two) << min(bits, _MODELLED_BITS), rc.TWO_START * two)
 
 
-def decode_paths(data: bytes | memoryview, bits: int, neighbours: Int32s) -> Int64s:
+def decode_paths(data: bytes | memoryview, bits: int, neighbours: Int32s, two: bool = True) -> Int64s:
     """Invert :func:`encode_paths` with the same ``bits`` and ``neighbours``.
+
+    Args:
+        data: The bytes.
+        bits: Length of each path.
+        neighbours: Two earlier rows ``[N, 2]``.
+        two: Whether decisions have two contexts; before version 4 of the format, they had the second one alone.
 
     Raises:
         FormatError: There are more or fewer bytes than N paths take.
         ValueError: As for :func:`encode_paths`.
         TypeError: A dtype is wrong.
     """
-    contexts = _path_contexts(bits, neighbours)
+    contexts = _path_contexts(bits, neighbours, two)
     paths, words = np.empty(len(neighbours), np.int64), _words(data)
-    _check_used(words, _read_paths(words, bits, neighbours, paths, contexts))
+    _check_used(words, _read_paths(words, bits, neighbours, paths, contexts, two))
     return paths
 
 
@@ -123,31 +134,35 @@ def decode_keys(data: bytes | memoryview, depths: Int64s) -> Uint64s:
 def encode_integers(values: Integers, order: Int64s | None = None) -> bytes:
     """Bytes of integers ``[N, D]`` of absolute value below 2⁵², of the rows in an order ``[N]``.
 
-    Each column is written as values or as differences from row to row, whichever is smaller; one byte per column says
-    which. An integer is written as its number of bits, by an adaptive model of its column, its sign, the bit after the
-    leading one by a model, and the other bits without a model.
+    Each column is written as values, as differences from row to row, from column to column, or as differences of these,
+    whichever is smallest; one byte per column says which. An integer is written as its number of bits, by an adaptive
+    model of its column, its sign, the bit after the leading one by a model, and the other bits without a model.
 
     Raises:
         ValueError: The values are not ``[N, D]``, not contiguous, or one is too large.
         TypeError: They are neither int64 nor int32.
     """
     check_array("values", values, values.shape, INT32 if values.dtype == INT32 else INT64)
-    if values.ndim != 2 or (values.size and max(-int(values.min()), int(values.max())) >= _TOO_LARGE):
+    largest = max(-int(values.min(initial=0)), int(values.max(initial=0)))
+    if values.ndim != 2 or largest >= _TOO_LARGE:
         raise ValueError(f"values must have shape [N, D] and be below 2^52 in size, got {list(values.shape)}")
     order = np.arange(len(values)) if order is None else order
     check_array("order", order, (len(values),), INT64)
     if order.size and (order.min() < 0 or order.max() >= len(values)):
         raise outside("order", order, len(values))
-    bits = np.empty((2, values.shape[1]), np.int64)  # approximately those of values, and of their steps
+    bits = np.empty((_MODES, values.shape[1]), np.int64)  # about as many as each mode takes
+    left = np.zeros(len(order), np.int64)
     for column, numbers in enumerate(values.T):
         ordered = numbers[order].astype(np.int64)
-        steps = np.diff(ordered, prepend=0)
-        bits[:, column] = [np.frexp(np.abs(each))[1].sum() for each in (ordered, steps)]
-    by_steps: Bools = bits[1] < bits[0]
+        both = [(each, np.diff(each, prepend=0)) for each in (ordered, ordered - left)]
+        bits[:, column] = [np.frexp(np.abs(each))[1].sum() for pair in both for each in pair]
+        left = ordered
+    # Differences of differences are to be below 2^53, too.
+    modes = bits[: _MODES if largest < _TOO_LARGE >> 1 else 2].argmin(0).astype(np.uint8)
     words = _room(int(bits.min(0).sum()) + 8 * values.size)
     contexts = rc.new_contexts(_INTEGER_CONTEXTS * values.shape[1])
-    used = _write_integers(values, order, by_steps, words, contexts)
-    return by_steps.astype(np.uint8).tobytes() + _bytes(words, used)
+    used = _write_integers(values, order, modes, words, contexts)
+    return modes.tobytes() + _bytes(words, used)
 
 
 def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> Int64s:
@@ -158,9 +173,11 @@ def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> Int64s
     """
     if len(data) < columns:
         raise FormatError(f"damaged: {len(data)} bytes for {columns} columns of integers")
-    by_steps = np.frombuffer(data[:columns], np.uint8).astype(bool)
+    modes = np.frombuffer(data[:columns], np.uint8)
+    if (modes >= _MODES).any():
+        raise FormatError(f"damaged: a column of integers has mode {modes.max()}, the largest is {_MODES - 1}")
     values, words = np.empty((rows, columns), np.int64), _words(data[columns:])
-    used = _read_integers(words, by_steps, values, rc.new_contexts(_INTEGER_CONTEXTS * columns))
+    used = _read_integers(words, modes, values, rc.new_contexts(_INTEGER_CONTEXTS * columns))
     _check_used(words, used, "an integer is not below 2^52 in size")
     return values
 
@@ -213,10 +230,11 @@ def _way(neighbour, path, left):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _context(first, second, path, left, bits):  # type: ignore[no-untyped-def]
-    """The node where a decision is taken, and the branches of the two neighbours there."""
+def _contexts_of(first, second, path, left, bits, two):  # type: ignore[no-untyped-def]
+    """The node where a decision is taken, with the branches of the two neighbours there, and, with ``two``, alone."""
     node = (np.int64(1) << (bits - 1 - left)) + path
-    return _RELATIONS * node + 3 * _way(first, path, left) + _way(second, path, left)
+    context = _RELATIONS * node + 3 * _way(first, path, left) + _way(second, path, left)
+    return context, (_RELATIONS << min(bits, _MODELLED_BITS)) + node if two else context
 
 
 @_stream_kernel
@@ -228,23 +246,23 @@ def _write_paths(paths, bits, neighbours, words, contexts):  # type: ignore[no-u
         path = np.int64(0)
         for left in range(bits - 1, plain - 1, -1):
             bit = (paths[i] >> left) & 1
-            context = _context(first, second, path, left, bits)
-            low, width, used = rc.encode_bit(bit, context, contexts, low, width, words, used)
+            context, quick = _contexts_of(first, second, path, left, bits, True)
+            low, width, used = rc.encode_bit(bit, context, quick, contexts, low, width, words, used)
             path = 2 * path + bit
         low, width, used = rc.encode_plain(paths[i] & ((1 << plain) - 1), plain, low, width, words, used)
     return rc.encode_end(low, words, used)
 
 
 @_stream_kernel
-def _read_paths(words, bits, neighbours, paths, contexts):  # type: ignore[no-untyped-def]
+def _read_paths(words, bits, neighbours, paths, contexts, two):  # type: ignore[no-untyped-def]
     code, width, used = rc.decode_start(words)
     plain = max(0, bits - _MODELLED_BITS)
     for i in range(len(paths)):
         first, second = _path_of(paths, neighbours[i, 0]), _path_of(paths, neighbours[i, 1])
         path = np.int64(0)
         for left in range(bits - 1, plain - 1, -1):
-            context = _context(first, second, path, left, bits)
-            bit, code, width, used = rc.decode_bit(context, contexts, code, width, words, used)
+            context, quick = _contexts_of(first, second, path, left, bits, two)
+            bit, code, width, used = rc.decode_bit(context, quick, contexts, code, width, words, used)
             path = 2 * path + bit
         rest, code, width, used = rc.decode_plain(plain, code, width, words, used)
         paths[i] = (path << plain) + np.int64(rest)
@@ -282,7 +300,7 @@ def _write_length(length, start, contexts, low, width, words, used):  # type: ig
     node = 1
     for left in range(_LENGTH_BITS - 1, -1, -1):
         bit = (length >> left) & 1
-        low, width, used = rc.encode_bit(bit, start + node, contexts, low, width, words, used)
+        low, width, used = rc.encode_bit(bit, start + node, start + node, contexts, low, width, words, used)
         node = 2 * node + bit
     return low, width, used
 
@@ -291,7 +309,7 @@ def _write_length(length, start, contexts, low, width, words, used):  # type: ig
 def _read_length(start, contexts, code, width, words, used):  # type: ignore[no-untyped-def]
     node = 1
     for _ in range(_LENGTH_BITS):
-        bit, code, width, used = rc.decode_bit(start + node, contexts, code, width, words, used)
+        bit, code, width, used = rc.decode_bit(start + node, start + node, contexts, code, width, words, used)
         node = 2 * node + bit
     return node - (1 << _LENGTH_BITS), code, width, used
 
@@ -346,47 +364,52 @@ def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
 # Integers
 
 
+@inline
+def _expected(values, row, before, column, mode):  # type: ignore[no-untyped-def]
+    """What a number is written as the difference from; the row before is -1 for the first one."""
+    from_column, from_row = (mode & 2) > 0 and column > 0, (mode & 1) > 0 and before >= 0
+    found = np.int64(values[row, column - 1]) if from_column else np.int64(0)
+    if from_row:
+        found += np.int64(values[before, column]) - (np.int64(values[before, column - 1]) if from_column else 0)
+    return found
+
+
 @_stream_kernel
-def _write_integers(values, order, by_steps, words, contexts):  # type: ignore[no-untyped-def]
+def _write_integers(values, order, modes, words, contexts):  # type: ignore[no-untyped-def]
     low, width, used = uint64(0), _START, 0
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
-            value = np.int64(values[order[i], j])
-            if by_steps[j] and i > 0:
-                value -= np.int64(values[order[i - 1], j])
+            before = order[i - 1] if i > 0 else -1
+            value = np.int64(values[order[i], j]) - _expected(values, order[i], before, j, modes[j])
             size = uint64(abs(value))
             length = _length(size)
             start = _INTEGER_CONTEXTS * j
             low, width, used = _write_length(length, start, contexts, low, width, words, used)
-            if length > 0:
-                low, width, used = rc.encode_plain(value < 0, 1, low, width, words, used)
+            low, width, used = rc.encode_plain(value < 0, min(length, 1), low, width, words, used)
             if length > 1:
                 second = np.int64(size >> uint64(length - 2)) & 1
                 context = _second_context(start, length)
-                low, width, used = rc.encode_bit(second, context, contexts, low, width, words, used)
+                low, width, used = rc.encode_bit(second, context, context, contexts, low, width, words, used)
                 low, width, used = rc.encode_plain(_below(size, length - 1), length - 2, low, width, words, used)
     return rc.encode_end(low, words, used)
 
 
 @_stream_kernel
-def _read_integers(words, by_steps, values, contexts):  # type: ignore[no-untyped-def]
+def _read_integers(words, modes, values, contexts):  # type: ignore[no-untyped-def]
     code, width, used = rc.decode_start(words)
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             start = _INTEGER_CONTEXTS * j
             length, code, width, used = _read_length(start, contexts, code, width, words, used)
-            sign, size = uint64(0), uint64(min(length, 1))
-            if length > 0:
-                sign, code, width, used = rc.decode_plain(1, code, width, words, used)
+            sign, code, width, used = rc.decode_plain(min(length, 1), code, width, words, used)
+            size = uint64(min(length, 1))
             if length > 1:
                 context = _second_context(start, length)
-                second, code, width, used = rc.decode_bit(context, contexts, code, width, words, used)
+                second, code, width, used = rc.decode_bit(context, context, contexts, code, width, words, used)
                 rest, code, width, used = rc.decode_plain(length - 2, code, width, words, used)
                 size = ((uint64(2) | uint64(second)) << uint64(length - 2)) | rest
-            value = -np.int64(size) if sign else np.int64(size)
-            if by_steps[j] and i > 0:
-                value += values[i - 1, j]
-            if not -_TOO_LARGE < value < _TOO_LARGE:
+            value = (-np.int64(size) if sign else np.int64(size)) + _expected(values, i, i - 1, j, modes[j])
+            if length > _LONGEST or not -_TOO_LARGE < value < _TOO_LARGE:
                 return _OUTSIDE
             values[i, j] = value
         if _ended(words, used):

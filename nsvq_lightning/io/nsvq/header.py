@@ -12,7 +12,7 @@ import os
 import struct
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_type_hints
@@ -33,8 +33,9 @@ _T = TypeVar("_T")
 _NUMBERS = (int, float)
 # Its line ends and high bit expose transfers that treat it as text.
 MAGIC = b"\x89NSVQ\r\n\x1a"
-# Versions that are read. A file has the first one unless an attribute has what came with the second: a basis.
-VERSIONS = 2, 3
+# Versions that are read; the last is written. Before it, decisions of paths had one context, and columns of integers no
+# differences from each other; the first has no basis.
+VERSIONS = 2, 3, 4
 
 
 class AttributeEntry(NamedTuple):
@@ -93,6 +94,7 @@ class Header:
         config: Settings of the run; JSON values.
         metrics: Quality measured on the decoded file; None stands for NaN or infinity.
         cameras: Positions, relative to ``origin``, and focal lengths in pixels of the cameras of training, rounded.
+        version: Of the format, which is not in the JSON.
     """
 
     level: str
@@ -104,6 +106,7 @@ class Header:
     config: Json = field(default_factory=dict)
     metrics: dict[str, float | None] = field(default_factory=dict)
     cameras: tuple[tuple[float, ...], ...] = ()
+    version: int = VERSIONS[-1]
 
     @classmethod
     def of(
@@ -156,6 +159,7 @@ class Header:
         """
         try:
             table = asdict(self)
+            del table["version"]
             if not self.cameras:
                 del table["cameras"]
             for name, value in self.metrics.items():
@@ -251,8 +255,7 @@ def _rounded(cameras: Float64s) -> tuple[tuple[float, ...], ...]:
 def frame(header: Header, streams: Mapping[str, bytes]) -> list[bytes]:
     """The parts of the file, in order; the header's stream table has the names and lengths of ``streams``."""
     text = header.to_json()
-    version = VERSIONS[any(entry.storage == "components" for entry in header.attributes)]
-    parts = [struct.pack("<II", version, len(text)), text, *(streams[stream.name] for stream in header.streams)]
+    parts = [struct.pack("<II", header.version, len(text)), text, *(streams[stream.name] for stream in header.streams)]
     digest = blake2b(digest_size=16)
     for part in parts:
         digest.update(part)
@@ -273,12 +276,11 @@ def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
     if blake2b(memoryview(data)[_DIGEST_END:], digest_size=len(digest)).digest() != digest:
         raise FormatError("truncated or altered: the checksum does not fit the content")
     if version not in VERSIONS:
-        known = " and ".join(map(str, VERSIONS))
-        raise FormatError(f"version {version} of the format; this release reads {known}", "update nsvq-lightning")
+        raise FormatError(f"version {version} of the format, which this release cannot read", "update nsvq-lightning")
     start = _PREFIX.size + json_bytes
     if start > len(data):
         raise FormatError(f"damaged: a header of {json_bytes} bytes in a file of {len(data)}")
-    header = Header.from_json(data[_PREFIX.size : start])
+    header = replace(Header.from_json(data[_PREFIX.size : start]), version=version)
     payload = memoryview(data)[start:]
     streams: dict[str, memoryview] = {}
     end = 0

@@ -4,7 +4,9 @@ A range coder (Martin 1979) with a 64-bit window that moves by 32-bit words: the
 divided in proportion to the probability of a bit. A carry out of ``low`` is added to the words already written.
 
 The probability of a bit is kept per *context* as a 16-bit number that moves towards each bit it meets, by 1/(n + 1.6)
-at the n-th and finally by 1/128: as exact as a count at first, as adaptive as a running mean later.
+at the n-th and finally by 1/128: as exact as a count at first, as adaptive as a running mean later. A bit may have two
+contexts, and the mean of their probabilities: one that knows much and moves by 1/62 in the end, and one that knows
+little and follows quickly, by 1/8.
 """
 
 import numpy as np
@@ -13,8 +15,11 @@ from numba import uint32, uint64
 from nsvq_lightning.compute.jit import inline
 from nsvq_lightning.splats.conventions import Uint32s
 
-# Number of bits after which the probability of a context moves at its slowest.
+# Number of bits after which the probability of a context moves at its slowest: of one alone, ...
 COUNT_LIMIT = 126
+# ... and of two; and how many these seem to have met at first, as the few that contexts of large codebooks meet tell
+# little.
+SLOW_LIMIT, QUICK_LIMIT, TWO_START = 60, 6, 2
 
 _FULL = uint64(0xFFFFFFFFFFFFFFFF)
 _LOW_WORD = uint64(0xFFFFFFFF)
@@ -22,14 +27,14 @@ _LOW_WORD = uint64(0xFFFFFFFF)
 PLAIN_BITS = 16
 
 
-def new_contexts(count: int) -> Uint32s:
+def new_contexts(count: int, met: int = 0) -> Uint32s:
     """States ``[count]``: the probability of a 1 in 65536ths times 256, plus how many bits were met."""
-    return np.full(count, 1 << 23, np.uint32)
+    return np.full(count, (1 << 23) + met, np.uint32)
 
 
 @inline
-def _chance(context, contexts):
-    return uint64(contexts[context] >> uint32(8))
+def _chance(context, quick, contexts):
+    return ((contexts[context] >> uint32(8)) + uint64(contexts[quick] >> uint32(8))) >> uint64(1)
 
 
 _RATES = np.rint(65536 / (np.arange(COUNT_LIMIT + 1) + 1.6)).astype(np.int64)
@@ -38,13 +43,20 @@ _MIN_CHANCE = 48
 
 
 @inline
-def _learn(bit, context, contexts):
+def _learn(bit, context, contexts, limit):
     """Move the probability towards the bit; without branches, which would be unpredictable."""
     n = np.int64(contexts[context] & uint32(255))
     chance = np.int64(contexts[context] >> uint32(8))
     target = _MIN_CHANCE + np.int64(bit) * (65536 - 2 * _MIN_CHANCE)
     chance += ((target - chance) * _RATES[n]) >> 16
-    contexts[context] = uint32((chance << 8) + n + (n < COUNT_LIMIT))
+    contexts[context] = uint32((chance << 8) + n + (n < limit))
+
+
+@inline
+def _learn_both(bit, context, quick, contexts):
+    _learn(bit, context, contexts, COUNT_LIMIT if context == quick else SLOW_LIMIT)
+    if context != quick:
+        _learn(bit, quick, contexts, QUICK_LIMIT)
 
 
 @inline
@@ -69,16 +81,19 @@ def _shift_out(low, width, words, used):
 
 
 @inline
-def encode_bit(bit, context, contexts, low, width, words, used):
-    """Write a bit; returns the new ``low, width, used``. Start with ``0, 2⁶⁴ − 1, 0``."""
-    part = (width >> uint64(16)) * _chance(context, contexts)
+def encode_bit(bit, context, quick, contexts, low, width, words, used):
+    """Write a bit, of two contexts or of the same one twice; returns the new ``low, width, used``.
+
+    Start with ``0, 2⁶⁴ − 1, 0``.
+    """
+    part = (width >> uint64(16)) * _chance(context, quick, contexts)
     one = uint64(0) - uint64(bit)  # all bits set for 1, none for 0
     before = low
     low += part & ~one
     width = (part & one) | ((width - part) & ~one)
     if low < before:
         _carry(words, used)
-    _learn(bit, context, contexts)
+    _learn_both(bit, context, quick, contexts)
     return _shift_out(low, width, words, used)
 
 
@@ -130,14 +145,14 @@ def _shift_in(code, width, words, used):
 
 
 @inline
-def decode_bit(context, contexts, code, width, words, used):
+def decode_bit(context, quick, contexts, code, width, words, used):
     """Read a bit; returns it and the new ``code, width, used``."""
-    part = (width >> uint64(16)) * _chance(context, contexts)
+    part = (width >> uint64(16)) * _chance(context, quick, contexts)
     bit = np.int64(code < part)
     one = uint64(0) - uint64(bit)
     code -= part & ~one
     width = (part & one) | ((width - part) & ~one)
-    _learn(bit, context, contexts)
+    _learn_both(bit, context, quick, contexts)
     code, width, used = _shift_in(code, width, words, used)
     return bit, code, width, used
 

@@ -44,14 +44,13 @@ class Stored(NamedTuple):
         return np.multiply(integers, self.entry.step, out=np.empty(integers.shape, np.float32), casting="same_kind")
 
 
-def rounded(scene: CompressedScene, name: str, precision: Precision, along: Integers) -> Stored:
+def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
     """An attribute, but not the positions, as integers.
 
     Args:
         scene: The scene.
         name: The attribute.
         precision: The largest errors.
-        along: The splats ``[N]`` in an order in which neighbours follow each other.
 
     Raises:
         ValueError: A value is too large for its step.
@@ -69,49 +68,21 @@ def rounded(scene: CompressedScene, name: str, precision: Precision, along: Inte
         rows = scene.raw[name]
         step = 2 * precision.of(name)
         return Stored(AttributeEntry(name, rows.shape[1], "steps", step=step), _integers(name, rows, step))
-    return _coded(name, scene.codes[name], scene.codebooks[name], precision.codebook, along)
+    return _coded(name, scene.codes[name], scene.codebooks[name], precision.codebook)
 
 
-def _coded(name: str, codes: Integers, codebook: Float32s, error: float, along: Integers) -> Stored:
+def _coded(name: str, codes: Integers, codebook: Float32s, error: float) -> Stored:
     used = np.bincount(codes, minlength=len(codebook)) > 0
     rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
     directions = unit(rows).astype(np.float32) if name == "quats" else rows
     distinct = np.unique(directions, axis=0)
     distance = sibling_distance(distinct[tree_order(distinct)])
     step = _step(rows, 2 * error * distance or 2.0**-16)
-    integers, first, merged = np.unique(_integers(name, rows, step), axis=0, return_index=True, return_inverse=True)
+    integers, merged = np.unique(_integers(name, rows, step), axis=0, return_inverse=True)
     merged_codes = merged.reshape(-1)[np.cumsum(used)[codes] - 1]
-    groups = _groups(first.argsort(), merged_codes[along])
-    order = np.concatenate([group[tree_order((integers[group] * step).astype(np.float32))] for group in groups])
+    order = tree_order((integers * step).astype(np.float32))
     entry = AttributeEntry(name, rows.shape[1], "codes", len(integers), step)
     return Stored(entry, order.argsort()[merged_codes], integers[order])
-
-
-# Neighbours are in different halves so many times more rarely than other splats, where a half belongs to a part.
-_APART = 10
-
-
-def _groups(rows: Int64s, codes: Integers) -> list[Int64s]:
-    """Rows ``[K]`` of a codebook in halves, and halves of these, as long as neighbours have codes of the same one.
-
-    In a joined scene, that keeps the codebooks of its parts apart: neighbours tell the first branches of a path. In
-    any other one, all rows stay together.
-
-    Args:
-        rows: In the order that they were given.
-        codes: Of the splats ``[N]``, neighbours after one another.
-    """
-    groups = [rows]
-    while len(groups[-1]) > 1:
-        halves = [half for group in groups for half in np.split(group, [(len(group) + 1) // 2])]
-        half_of = np.empty(len(rows), np.int64)
-        half_of[np.concatenate(halves)] = np.repeat(np.arange(len(halves)), [len(half) for half in halves])
-        found = half_of[codes]
-        shares = np.bincount(found) / max(1, len(found))
-        if _APART * np.mean(np.diff(found, prepend=found[:1]) != 0) >= 1 - np.square(shares).sum():
-            break
-        groups = halves
-    return groups
 
 
 def _step(rows: Float32s, wanted: float) -> float:

@@ -101,7 +101,7 @@
     if (checksum(data.subarray(24)).some((byte, i) => data[8 + i] !== byte)) refuse("its checksum does not fit its content");
     const view = new DataView(data.buffer, data.byteOffset, data.length);
     const version = view.getUint32(24, true), length = view.getUint32(28, true);
-    if (version !== 2 && version !== 3) throw new Error(`.nsvq version ${version} is not 2 or 3, those that this reader knows`);
+    if (version < 2 || version > 4) throw new Error(`.nsvq version ${version} is not 2 to 4, those that this reader knows`);
     if (PREFIX + length > data.length) refuse("its header is longer than the file");
     let header;
     try {
@@ -109,7 +109,7 @@
     } catch (error) {
       refuse(`its header cannot be read (${error.message})`);
     }
-    return { header, body: data.subarray(PREFIX + length) };
+    return { header, version, body: data.subarray(PREFIX + length) };
   }
 
   // The header
@@ -128,7 +128,7 @@
   }
 
   // Attribute entries and streams by name, both checked against everything that the counts ask for.
-  function layout({ header, body }) {
+  function layout({ header, body, version }) {
     const { level, splats, sh_degree: degree, origin } = header || {};
     if (level !== "compact" && level !== "paper") refuse(`its level ${level} is unknown`);
     if (!natural(splats) || !natural(degree) || degree > 3) refuse("its header lacks the number of splats or the SH degree");
@@ -180,7 +180,7 @@
     for (const { name, codes } of coded)
       if (level === "compact" && codes > Math.max(FEW_ROWS, streams[`${name}.codebook`].length)) refuse(`its codebook of ${name} is too large`);
     if (level === "compact" && splats > Math.max(FEW_SPLATS, body.length / 2)) refuse("it has too many splats for its length");
-    return { level, splats, degree, origin, table, streams };
+    return { level, splats, degree, origin, table, streams, version };
   }
 
   // The range decoder
@@ -190,14 +190,14 @@
   const CODE_HIGH = 0, CODE_LOW = 1, HIGH = 2, LOW = 3;
 
   class RangeDecoder {
-    constructor(data, contexts) {
+    constructor(data, contexts, met = 0) {
       if (data.length % 4) refuse("the length of a stream is not a multiple of 4");
       this.words = new Uint32Array(data.slice().buffer);
       this.used = 2;
       // Code and width, unsigned numbers of 64 bits, as halves; in an array, since fields above 2^31 are slow.
       this.state = Uint32Array.of(this.words.length > 0 ? this.words[0] : 0, this.words.length > 1 ? this.words[1] : 0, ~0, ~0);
       this.chances = new Uint16Array(contexts).fill(32768);
-      this.seen = new Uint8Array(contexts);
+      this.seen = new Uint8Array(contexts).fill(met);
     }
 
     refill() { // when the width is below 2^32
@@ -209,8 +209,8 @@
       if (this.used++ > this.words.length) this.end(); // what would follow is worth no time
     }
 
-    bit(context) {
-      const state = this.state, chance = this.chances[context], seen = this.seen[context];
+    bit(context, quick = context) { // of one context, or by the mean of two
+      const state = this.state, chance = (this.chances[context] + this.chances[quick]) >>> 1;
       const product = (((state[HIGH] << 16) | (state[LOW] >>> 16)) >>> 0) * chance; // below 2^48
       const low = product >>> 0, high = ((state[HIGH] >>> 16) * chance + Math.floor(product / TWO32)) >>> 0;
       const codeHigh = state[CODE_HIGH], codeLow = state[CODE_LOW];
@@ -225,10 +225,20 @@
         state[HIGH] = state[HIGH] - high - (state[LOW] < low ? 1 : 0);
         state[LOW] = state[LOW] - low;
       }
-      this.chances[context] = chance + (((48 + 65440 * one - chance) * RATES[seen]) >> 16);
-      if (seen < 126) this.seen[context] = seen + 1;
+      const target = 48 + 65440 * one;
+      if (quick === context) this.learn(context, target, 126);
+      else {
+        this.learn(context, target, 60);
+        this.learn(quick, target, 6);
+      }
       if (state[HIGH] === 0) this.refill();
       return one;
+    }
+
+    learn(context, target, limit) {
+      const chance = this.chances[context], seen = this.seen[context];
+      this.chances[context] = chance + (((target - chance) * RATES[seen]) >> 16);
+      if (seen < limit) this.seen[context] = seen + 1;
     }
 
     digit(bits) { // a number of 1 to 16 bits, without a model
@@ -288,10 +298,10 @@
     return low;
   }
 
-  // Leaf of each row; neighbours [2 * rows] holds pairs of earlier rows, -1 for none.
-  function decodePaths(data, count, rows, neighbours) {
-    const bits = bitsOf(count), modelled = Math.min(bits, 16), whole = count === 2 ** bits;
-    const decoder = new RangeDecoder(data, 9 << modelled), paths = new Uint16Array(rows), leaves = new Uint32Array(rows);
+  // Leaf of each row; neighbours [2 * rows] holds pairs of earlier rows, -1 for none. Decisions have two contexts, or one.
+  function decodePaths(data, count, rows, neighbours, paired) {
+    const bits = bitsOf(count), modelled = Math.min(bits, 16), whole = count === 2 ** bits, alone = 9 << modelled;
+    const decoder = new RangeDecoder(data, paired ? 10 << modelled : alone, paired ? 2 : 0), paths = new Uint16Array(rows), leaves = new Uint32Array(rows);
     for (let row = 0; row < rows; row++) {
       const first = neighbours[2 * row], second = neighbours[2 * row + 1];
       let path = 0, one = first < 0 ? -1 : paths[first], two = second < 0 ? -1 : paths[second];
@@ -300,7 +310,8 @@
         if (one >> (left + 1) !== path) one = -1;
         if (two >> (left + 1) !== path) two = -1;
         const saysOne = one < 0 ? 0 : 1 + ((one >> left) & 1), saysTwo = two < 0 ? 0 : 1 + ((two >> left) & 1);
-        path = 2 * path + decoder.bit(9 * ((1 << (modelled - 1 - left)) + path) + 3 * saysOne + saysTwo);
+        const node = (1 << (modelled - 1 - left)) + path, context = 9 * node + 3 * saysOne + saysTwo;
+        path = 2 * path + decoder.bit(context, paired ? alone + node : context);
       }
       paths[row] = path;
       const full = path * 2 ** (bits - modelled) + decoder.plain(bits - modelled);
@@ -314,7 +325,9 @@
   function decodeIntegers(data, rows, columns, take) {
     if (data.length < columns) refuse("a stream of integers is too short");
     const decoder = new RangeDecoder(data.subarray(columns), 128 * columns), sums = new Float64Array(columns);
+    for (let column = 0; column < columns; column++) if (data[column] > 3) refuse("a column of integers has an unknown mode");
     for (let row = 0; row < rows; row++) {
+      let before = 0; // what the column before has
       for (let column = 0; column < columns; column++) {
         const length = decoder.length(column);
         let value = 0;
@@ -328,7 +341,9 @@
           }
           if (negative) value = -value;
         }
-        if (data[column]) value = sums[column] += value;
+        if (data[column] & 1) value = sums[column] += value;
+        if (data[column] & 2) value += before;
+        before = value;
         if (Math.abs(value) >= LARGEST) refuse("an integer is beyond 2^52");
         take(row, column, value);
       }
@@ -458,7 +473,7 @@
     return values;
   }
 
-  function decodeCompact({ splats, table, streams }) {
+  function decodeCompact({ splats, table, streams, version }) {
     const values = {}, leaves = {}, integers = {};
     if (streams["means.grid"].length !== 32) refuse("its grid is not 32 bytes");
     if (streams["means.far"].length % 12 || streams["means.far"].length > 12 * splats) refuse("its far positions have the wrong length");
@@ -477,7 +492,7 @@
           if (exact) exact[row * dim + column] = value;
         });
       }
-      if (storage !== "steps") leaves[name] = decodePaths(streams[name], codes, splats, neighbours);
+      if (storage !== "steps") leaves[name] = decodePaths(streams[name], codes, splats, neighbours, version > 3);
       if (storage !== "levels") values[name] = storage === "codes" ? taken(found, dim, leaves[name]) : found;
     }
 

@@ -93,7 +93,7 @@ def test_coefficients_and_basis_are_exact(tmp_path: Path, degree: int) -> None:
     assert twice.read_bytes() == once.read_bytes()
     write_nsvq(twice, back, Storage("paper"))
     plain = read_nsvq(twice)
-    assert (once.read_bytes()[24], twice.read_bytes()[24], plain.bases) == (3, 2, {})
+    assert plain.bases == {}
     np.testing.assert_array_equal(plain.values("shN"), expected)
     # Zeros of a quarter turn are not quite 0; the step does not follow them.
     write_nsvq(twice, rotated(back, Rotation.from_rotvec([np.pi / 2, 0, 0]).as_matrix()))
@@ -262,26 +262,3 @@ def test_it_is_much_smaller_than_the_level_paper(tmp_path: Path) -> None:
     streams = {stream.name: stream.length for stream in read_header(tmp_path / "c.nsvq").streams}
     assert 8 * streams["means"] / 20_000 < 28
     assert 8 * streams["opacities"] / 20_000 < 7.1
-
-
-def test_codebooks_of_joined_parts_stay_apart() -> None:
-    """What neighbours have says which part a code is of: it costs next to nothing."""
-    sizes = {"scales": 64, "quats": 64}
-    parts = [scene(3000 + k, sizes) for k in range(4)]  # other draws of the same kind
-    apart = [replace(part, means=part.means + 40 * np.float32(k)) for k, part in enumerate(parts)]
-
-    def bits(given: CompressedScene) -> float:
-        _, streams = encode(given, Storage())
-        return 8 * (len(streams["scales"]) + len(streams["quats"])) / len(given)
-
-    whole = CompressedScene.joined(apart)
-    assert bits(whole) == pytest.approx(np.mean([bits(part) for part in apart]), abs=0.2)
-    # Codes of other places, all over the codebook, cost two bits more each, as there are four times as many.
-    draws = np.random.default_rng(0)
-    mixed = {name: draws.permutation(len(rows)) for name, rows in whole.codebooks.items()}
-    shuffled = replace(
-        whole,
-        codes={name: mixed[name].argsort()[codes] for name, codes in whole.codes.items()},
-        codebooks={name: rows[mixed[name]] for name, rows in whole.codebooks.items()},
-    )
-    assert bits(shuffled) > bits(whole) + 2

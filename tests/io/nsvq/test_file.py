@@ -176,8 +176,8 @@ def test_a_code_beyond_its_codebook_is_refused(tmp_path: Path) -> None:
 def test_a_newer_version_says_so(tmp_path: Path) -> None:
     path = tmp_path / "x.nsvq"
     write_nsvq(path, scene(4, {}))
-    forge(path, lambda header: None, version=4)
-    with pytest.raises(FormatError, match="version 4 of the format; this release reads 2 and 3; update"):
+    forge(path, lambda header: None, version=5)
+    with pytest.raises(FormatError, match="version 5 of the format, which this release cannot read; update"):
         read_nsvq(path)
 
 

@@ -82,18 +82,30 @@ def test_numbers_are_those_of_the_package(tmp_path: Path, level: str, degree: in
 
 
 def test_components_at_their_limits(tmp_path: Path) -> None:
-    """Sums above 2^50, at the finest and the coarsest step; the version does not matter."""
+    """Sums above 2^50, at the finest and the coarsest step."""
     generator, most, paths = np.random.default_rng(3), 2**23 - 1, [tmp_path / "fine.nsvq", tmp_path / "coarse.nsvq"]
-    for path, step, version in zip(paths, (2.0**-149, 1.0), (2, 3), strict=True):
+    for path, step in zip(paths, (2.0**-149, 1.0), strict=True):
         made = on_basis(scene(40, {}))
         write_nsvq(path, made)
         for name, rows in (("shN.basis", made.bases["shN"]), ("shN", made.raw["shN"])):
             numbers = most - generator.integers(0, 3, rows.shape)
             numbers[1:, 1:] *= generator.choice([-1, 0, 1], numbers[1:, 1:].shape)
             _with_stream(path, name, lambda _, numbers=numbers: encode_integers(numbers))
-        forge(path, lambda header, step=step: header["attributes"][5].__setitem__(4, step), version)
+        forge(path, lambda header, step=step: header["attributes"][5].__setitem__(4, step))
     assert np.abs(read_nsvq(paths[1]).values("shN")).max() > 2.0**50
     compare(*paths)
+
+
+@pytest.mark.parametrize(("version", "made"), [(2, scene(60)), (3, on_basis(scene(60, {})))])
+def test_files_of_earlier_versions_hold_what_they_held(tmp_path: Path, version: int, made: CompressedScene) -> None:
+    old, new = ROOT / f"tests/io/nsvq/version_{version}.nsvq", tmp_path / "new.nsvq"
+    write_nsvq(new, made)
+    held, expected = (vars(arrays_of(read_nsvq(path))) for path in (old, new))
+    assert (old.read_bytes()[24], new.read_bytes()[24]) == (version, 4)
+    assert held.keys() == expected.keys()
+    for name, values in held.items():
+        np.testing.assert_array_equal(values, expected[name], strict=True)
+    compare(old)
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -165,7 +177,7 @@ def test_flipped_bits_and_short_files_are_noticed(tmp_path: Path) -> None:
         (lambda header: header["streams"].reverse(), "streams are not those"),
         (lambda header: header["streams"][0].__setitem__(1, 10**9), "longer than the file"),
         (lambda header: header["streams"][-1].__setitem__(1, 0), "bytes follow"),
-        (lambda header: header.update(splats=21), "does not end with its last number"),
+        (lambda header: header.update(splats=21), "not a valid .nsvq file"),
         (lambda header: header.update(cameras=None), "cameras are not positions and focal lengths"),
         (lambda header: header.update(cameras=[[0, 0, 0]]), "cameras are not positions"),
         (lambda header: header.update(cameras=[[0, 0, 0, -1]]), "cameras are not positions"),
@@ -181,12 +193,12 @@ def test_a_header_that_cannot_be_is_refused(tmp_path: Path, change: Any, words: 
 
 
 @needs_node
-@pytest.mark.parametrize("version", [1, 4])
+@pytest.mark.parametrize("version", [1, 5])
 def test_another_version_is_told(tmp_path: Path, version: int) -> None:
     path = tmp_path / "a.nsvq"
     write_nsvq(path, scene(20))
     forge(path, lambda _: None, version=version)
-    assert f"version {version} is not 2 or 3" in refusal(path)
+    assert f"version {version} is not 2 to 4" in refusal(path)
 
 
 def _with_stream(path: Path, name: str, change: Any) -> None:

@@ -269,7 +269,7 @@ def test_moments_of_replaced_codes_are_reset(
             if state := trainer.optimizers[0].state.get(book):
                 zero_rows.append(int((~state["exp_avg_sq"].any(1)).sum()))
 
-    replacement = paper_replacement(jitter=0.5, reset_moments=reset)
+    replacement = paper_replacement(jitter=0.5 if reset else None)
     run([*recipe(codebook_replacement=replacement).values(), Moments()], max_steps=20)
     assert max(zero_rows[1:]) == (8 if reset else 0)
 
