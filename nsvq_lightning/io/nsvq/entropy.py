@@ -162,7 +162,7 @@ def encode_integers(values: Integers, order: Int64s | None = None) -> bytes:
     words = _room(int(bits.min(0).sum()) + 8 * values.size)
     contexts = rc.new_contexts(_INTEGER_CONTEXTS * values.shape[1])
     used = _write_integers(values, order, modes, words, contexts)
-    return modes.tobytes() + _bytes(words, used)
+    return bytes(modes) + _bytes(words, used)
 
 
 def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> Int64s:
