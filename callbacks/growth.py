@@ -328,7 +328,7 @@ def splats_for_bytes(
     # Position and opacity of a splat take 22 to 25 bits on the measured scenes.
     bits = 23.5 - 3 * math.log2(position) - math.log2(opacity)
     # What remains of codes and codebooks where codes are chosen by rate and distortion, as measured.
-    coded = 1 / (1 + 0.28 * strength)
+    coded = 1 / (1 + 0.25 * strength)
     books, codes = codebook_bits(codebooks)
     fixed, bits = fixed + coded * books, bits + coded * codes
     bits += 32 * sum(attribute_dims(sh_degree)[name] for name in QUANTIZABLE if name not in codebooks)

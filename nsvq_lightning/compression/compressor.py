@@ -90,7 +90,7 @@ ON_BASIS = 90
 # Bits of a splat's position and opacity, about.
 PLACE = 22.0
 # Rather than keep fewer splats than this share, a file takes smaller codebooks.
-SHARE = 0.7
+SHARE = 0.9
 # It has at least so many splats, if there are as many.
 MIN_SPLATS = 100
 
@@ -294,7 +294,7 @@ class Compressor:
                 if needed:
                     raise
                 break
-            found = self._fitting(setting, target)
+            found = self._fitting(setting, target) or self._fitting(replace(setting, more=0), target)
             if found and (best is None or len(found.data) > len(best.data)):
                 best = found
             # There may be more room than the largest codebooks take.

@@ -42,11 +42,11 @@ class Attribute:
 # The raw attributes by name, in the order of :meth:`nsvq_lightning.Splats.from_tensors`.
 ATTRIBUTES = {
     "means": Attribute((3,), "x y z", 3.2e-4),
-    "quats": Attribute((4,), "rot_", 2e-3, 1.0, error=0.005, row_bits=0.3, code_bits=5.7),
-    "scales": Attribute((3,), "scale_", 0.01, 1.0, error=0.02, row_bits=0.0, code_bits=6.0),
+    "quats": Attribute((4,), "rot_", 2e-3, 1.0, error=0.005, row_bits=-0.1, code_bits=5.7),
+    "scales": Attribute((3,), "scale_", 0.01, 1.0, error=0.02, row_bits=-0.5, code_bits=5.8),
     "opacities": Attribute((), "opacity", 0.025),
-    "sh0": Attribute((1, 3), "f_dc_", 2.5e-3, 0.25, error=0.01, row_bits=-1.3, code_bits=5.9),
-    "shN": Attribute((-1, 3), "f_rest_", 5e-4, 0.25, error=0.01, row_bits=-1.4, code_bits=5.5),
+    "sh0": Attribute((1, 3), "f_dc_", 2.5e-3, 0.25, error=0.01, row_bits=-2.1, code_bits=6.0),
+    "shN": Attribute((-1, 3), "f_rest_", 5e-4, 0.25, error=0.01, row_bits=-2.2, code_bits=5.1),
 }
 
 # Codes of scales and rotations by the paper's names of codebook sizes, from the largest.

@@ -147,7 +147,7 @@ def test_without_codebooks_photos_teach_and_own_pictures_do_not() -> None:
 
 def test_settings_for_bytes_go_from_large_codebooks_to_fewer_splats() -> None:
     found = [setting_for(size, 100_000, 3) for size in (2_000_000, 1_300_000, 800_000, 500_000, 100_000)]
-    assert [setting.codebooks for setting in found] == ["16k", "16k", "8k", "0.5k", "0.5k"]
+    assert [setting.codebooks for setting in found] == ["16k", "16k", "4k", "0.5k", "0.5k"]
     assert [setting.splats for setting in found[:2]] == [100_000, 100_000]
     assert found[4].splats < found[3].splats < 100_000
     with pytest.raises(ValueError, match="100 bytes leave room for 0 of 100000 splats"):
