@@ -294,7 +294,9 @@ class Compressor:
                 if needed:
                     raise
                 break
-            found = self._fitting(setting, target) or self._fitting(replace(setting, more=0), target)
+            found = self._fitting(setting, target)
+            if not found and setting.more:
+                found = self._fitting(replace(setting, more=0), target)
             if found and (best is None or len(found.data) > len(best.data)):
                 best = found
             # There may be more room than the largest codebooks take.

@@ -19,7 +19,6 @@ import math
 import struct
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import numpy as np
 import torch
@@ -108,13 +107,13 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
     grid = morton.Grid(entries["means"].step, tuple(base))
     far = np.frombuffer(streams["means.far"], "<f4").astype(np.float32).reshape(-1, 3)
     with _workers() as pool:
-        decode = partial(_decoded, streams=streams, two=header.version > 3)
-        early = {name: pool.submit(decode, entries[name], near=_before(header.splats)) for name in _EARLY}
+        two = header.version > 3
+        early = {name: pool.submit(_decoded, entries[name], streams, _before(header.splats), two) for name in _EARLY}
         stored = {name: early[name].result() for name in _EARLY}
         depths = grid.depths(doublings_of(stored, doublings))[: header.splats - len(far)]
         keys = entropy.decode_keys(streams["means"], 3 * depths)
         neighbours = _neighbours(keys, depths, header.splats)
-        late = {name: pool.submit(decode, entries[name], near=neighbours) for name in _LONGEST_FIRST}
+        late = {name: pool.submit(_decoded, entries[name], streams, neighbours, two) for name in _LONGEST_FIRST}
         means = np.concatenate([grid.centers(morton.unmorton(keys), depths), far])
         stored |= {name: late[name].result() for name in _LATE}
     levels = stored.pop("opacities")

@@ -28,8 +28,6 @@ _RELATIONS = 9
 _START = uint64(0xFFFFFFFFFFFFFFFF)
 # Integers are below it in size: they and their sums are exact in float64.
 _TOO_LARGE = 1 << 52
-# Bits of a difference of two of them, at most.
-_LONGEST = 53
 _KEY_MASK = uint64((1 << KEY_BITS) - 1)
 # What a reader returns instead of the number of words when it meets a value out of range.
 _OUTSIDE = -1
@@ -409,7 +407,7 @@ def _read_integers(words, modes, values, contexts):  # type: ignore[no-untyped-d
                 rest, code, width, used = rc.decode_plain(length - 2, code, width, words, used)
                 size = ((uint64(2) | uint64(second)) << uint64(length - 2)) | rest
             value = (-np.int64(size) if sign else np.int64(size)) + _expected(values, i, i - 1, j, modes[j])
-            if length > _LONGEST or not -_TOO_LARGE < value < _TOO_LARGE:
+            if size >= uint64(2 * _TOO_LARGE) or not -_TOO_LARGE < value < _TOO_LARGE:
                 return _OUTSIDE
             values[i, j] = value
         if _ended(words, used):

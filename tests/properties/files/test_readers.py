@@ -177,7 +177,7 @@ def test_flipped_bits_and_short_files_are_noticed(tmp_path: Path) -> None:
         (lambda header: header["streams"].reverse(), "streams are not those"),
         (lambda header: header["streams"][0].__setitem__(1, 10**9), "longer than the file"),
         (lambda header: header["streams"][-1].__setitem__(1, 0), "bytes follow"),
-        (lambda header: header.update(splats=21), "not a valid .nsvq file"),
+        (lambda header: header.update(splats=19), "does not end with its last number"),
         (lambda header: header.update(cameras=None), "cameras are not positions and focal lengths"),
         (lambda header: header.update(cameras=[[0, 0, 0]]), "cameras are not positions"),
         (lambda header: header.update(cameras=[[0, 0, 0, -1]]), "cameras are not positions"),
