@@ -285,6 +285,5 @@ def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -
     from nsvq_lightning.data.scene import spread
 
     cameras, photos = known_views(path, root, splats.means.detach().cpu().numpy())
-    if photos is not None:
-        return spread(photos.train_cameras, most)
-    return spread(list(cameras.values()), most) or square_views(splats, most)
+    known = list(cameras.values()) if photos is None else photos.train_cameras
+    return spread(known, most) or square_views(splats, most)

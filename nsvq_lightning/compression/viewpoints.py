@@ -11,6 +11,7 @@ from torch import Tensor
 from nsvq_lightning.data.images import ImageStore, Picture
 from nsvq_lightning.data.points import in_picture
 from nsvq_lightning.data.scene import Scene, spread
+from nsvq_lightning.io.morton import spatial_order
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
@@ -80,10 +81,8 @@ class Measure:
 
     def error(self, splats: SplatTensors) -> float:
         """Root mean square difference for channels in [0, 1]."""
-        squares = []
-        for camera, expected in zip(self.cameras, self._expected, strict=True):
-            (found,) = pictures(splats, [camera], self._antialiased)
-            squares.append(float((found - expected).double().square().mean()))
+        found = (pictures(splats, [camera], self._antialiased)[0] for camera in self.cameras)
+        squares = [float((a - b).double().square().mean()) for a, b in zip(found, self._expected, strict=True)]
         return math.sqrt(np.mean(squares))
 
 
@@ -107,8 +106,7 @@ def own_scene(
     Raises:
         ValueError: There is not one photo of the camera's size for each camera.
     """
-    sizes = [(camera.height, camera.width, 3) for camera in cameras]
-    if photos and [tuple(photo.shape) for photo in photos] != sizes:
+    if photos and [tuple(photo.shape) for photo in photos] != [(camera.height, camera.width, 3) for camera in cameras]:
         raise ValueError(f"expected a photo [H, W, 3] of its size for each of {len(cameras)} cameras")
     split = "1 in 8" if photos else OWN
     bytes_ = [
@@ -186,12 +184,14 @@ SOME_DETAIL = 250_000
 # Where they stand, in spreads of the detail from its middle: around a scene, or inside it up to this.
 AROUND = 0.9, 3.0
 INSIDE = 0.8
-# So many places around decide. On six scenes of objects, colours change 0.4 to 0.6 times as much towards the middle as
-# towards the best of these, in a room 1.2 times.
-PLACES = 48
-# Power of how much colours change towards a place: photos were taken where that is largest. With 4, bonsai lost 0.04 dB
-# more.
+# Places at the farthest distance decide: on four scenes of objects, colours follow the line of sight to the
+# middle 0.3 to 0.7 times as much as that to the best of them, in a room 1.75 times.
+# Power of how much colours follow the line of sight to a place. With 4, bonsai lost 0.04 dB more.
 SHARPNESS = 8
+# Nepers that one unit of variance of the logarithm of sizes in pixels takes from it.
+EVENNESS = 3
+# Cells of space that are asked on their own where they were seen from. 1 and 4 find fewer cameras, 1024 as many.
+CELLS = 256
 # Horizontal field of view: in narrower pictures, edges of photos are not seen; wider ones show too much of what is far.
 ANGLE = math.radians(65)
 
@@ -199,11 +199,10 @@ ANGLE = math.radians(65)
 def likely_cameras(splats: SplatTensors, count: int, width: int = 560, height: int = 392) -> list[Camera]:
     """Cameras from which a scene shows much detail, as it does where photos were taken, the best one first.
 
-    A trained scene is sharp from where its photos were taken and blurred or empty from elsewhere. Its colours change
-    most towards there, as spherical harmonics start at 0 and are fitted along the lines of sight of training alone:
-    weighted by opacity, that finds places near the cameras of bonsai (half are within 0.4 spreads of one, by detail
-    alone within 1.0). Only where colours of small splats change more towards the middle than towards any place around,
-    as in a room, candidates stand inside.
+    A trained scene is sharp from where its photos were taken and blurred or empty from elsewhere. From there, its
+    splats have about one size in pixels, and its colours follow the line of sight (:func:`_following`). Candidates are
+    even in space and direction, as random ones decided 0.1 to 0.3 dB. Only where colours follow the line of sight to
+    the middle more than that to any place around, as in a room, candidates stand inside.
 
     Args:
         splats: Raw attributes of N > 0 splats.
@@ -218,27 +217,18 @@ def likely_cameras(splats: SplatTensors, count: int, width: int = 560, height: i
     weights = (detail / detail.sum()).cpu().numpy()
     middle = weights @ means
     reach = math.sqrt(weights @ ((means - middle) ** 2).sum(1)) or 1.0
-    candidates = 5 * count
-    draws = np.random.default_rng(0)
-    directions = draws.standard_normal((candidates, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    away = draws.uniform(*AROUND, (candidates, 1))
-    eyes = middle + reach * away * directions
-    few, shares = RawSplats(*(spread(tensor, SOME_SPLATS) for tensor in raw)), spread(detail, SOME_SPLATS)
-    if _change(few, shares, middle) > max(_change(few, shares, eye) for eye in eyes[:PLACES]):
-        eyes = middle + reach * INSIDE * (away / AROUND[1]) * directions
-    targets = middle + reach * 0.4 * draws.standard_normal((candidates, 3))
-    across, up, _ = np.abs(eyes - targets).T
-    # Straight up or down, a camera has no upright.
-    eyes[:, 0] += np.where(across < 0.05 * up, 0.2 * up, 0.0)
-    low = round(96 * height / width)
+    even: Tensor = torch.quasirandom.SobolEngine(7, scramble=True, seed=0).draw(5 * count)  # type: ignore[no-untyped-call]
+    normal = torch.special.ndtri(even.double().clamp(1e-3, 1 - 1e-3)).numpy()
+    directions = normal[:, :3] / np.linalg.norm(normal[:, :3], axis=1, keepdims=True)
+    away = AROUND[0] + (AROUND[1] - AROUND[0]) * even[:, 6:].numpy()
     some = RawSplats(*(spread(tensor, SOME_DETAIL).contiguous() for tensor in raw))
-    opaque = few.opacities.sigmoid()
-    changes = np.array([_change(few, opaque, eye) for eye in eyes])
+    in_middle, *around = _following(some, middle + reach * np.vstack([np.zeros(3), AROUND[1] * directions]))
+    eyes = middle + reach * (INSIDE * away / AROUND[1] if in_middle > max(around) else away) * directions
+    targets = middle + reach * 0.4 * normal[:, 3:6]
+    low = round(96 * height / width)
     details = np.array([_detail(some, look_at(*at, 96, low, ANGLE)) for at in zip(targets, eyes, strict=True)])
-    # Without harmonics, detail alone decides.
-    best = np.argsort(-details * (changes + 1e-3) ** SHARPNESS, kind="stable")[:count]
-    return [look_at(targets[k], eyes[k], width, height, ANGLE) for k in best]
+    scores = details * _following(some, eyes) ** SHARPNESS * np.exp(-EVENNESS * _size_variances(some, eyes))
+    return [look_at(targets[k], eyes[k], width, height, ANGLE) for k in np.argsort(-scores, kind="stable")[:count]]
 
 
 def square_views(splats: SplatTensors, most: int) -> list[Camera]:
@@ -246,15 +236,35 @@ def square_views(splats: SplatTensors, most: int) -> list[Camera]:
     return likely_cameras(splats, most, 640, 640)
 
 
-def _change(splats: SplatTensors, weights: Tensor, eye: Float64s) -> float:
-    """How much colours differ from their mean towards a place, squared: most where photos were taken.
+def _following(splats: RawSplats, places: Float64s) -> Float64s:
+    """How much colours follow the lines of sight to each of some places ``[P]``, most where photos were taken.
 
-    Spherical harmonics start at 0, and are fitted along the lines of sight of training alone.
+    Spherical harmonics c start at 0, and are fitted along the lines of sight of training alone. So in a cell of space,
+    their mean C of c cᵀ over splats, each of length 1 and weighted by opacity, is large along Y(d) for those directions
+    d: 1 / Y(d)ᵀ C⁻¹ Y(d) (Capon 1969), in the mean over :data:`CELLS`. It is 1 without harmonics.
     """
-    directions = torch.nn.functional.normalize(splats.means - torch.from_numpy(eye).to(splats.means))
-    bands = sh_basis(directions, sh_degree_of(splats.shN))[:, 1:, None]
-    found = (bands * splats.shN).sum(1).square().sum(1) / splats.shN.square().sum((1, 2)).clamp_min(1e-12)
-    return float(weights.float() @ found / weights.sum())
+    if not splats.shN.any():
+        return np.ones(len(places))
+    cells = np.array_split(spatial_order(splats.means.numpy()), min(CELLS, len(splats.means)))
+    opacities, found = splats.opacities.double().sigmoid() + 1e-30, np.zeros(len(places))
+    for cell in cells:
+        weights, shN = opacities[cell] / opacities[cell].sum(), splats.shN[cell].double()
+        shN = shN / shN.square().sum((1, 2), keepdim=True).sqrt().clamp_min(1e-12)
+        mean = torch.einsum("n,nic,njc->ij", weights, shN, shN)
+        # Not singular, and the less sharp the more noise there is.
+        mean += (0.02 * mean.diagonal().mean() + 1e-9) * torch.eye(len(mean))
+        lines = torch.nn.functional.normalize(weights @ splats.means[cell].double() - torch.from_numpy(places))
+        basis = sh_basis(lines, sh_degree_of(splats.shN))[:, 1:].T
+        found += 1 / (basis * torch.linalg.solve(mean, basis)).sum(0).numpy()
+    return found / len(cells)
+
+
+def _size_variances(splats: RawSplats, places: Float64s) -> Float64s:
+    """Variance of the logarithm of the splats' sizes in pixels as seen from each place ``[P]``, weighted by opacity."""
+    few = RawSplats(*(spread(tensor, SOME_SPLATS) for tensor in splats))
+    weights = few.opacities.sigmoid() / few.opacities.sigmoid().sum()
+    sizes = few.scales.mean(1) - torch.cdist(torch.from_numpy(places).float(), few.means).clamp_min(1e-12).log()
+    return ((sizes - (sizes @ weights)[:, None]).square() @ weights).double().numpy()
 
 
 @torch.no_grad()

@@ -12,7 +12,7 @@ from nsvq_lightning.io.ply import read_ply_columns, read_ply_header
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.poses import looked_at, poses
-from nsvq_lightning.splats.conventions import SH_C0, Bools, Float64s, Int64s, Uint8s
+from nsvq_lightning.splats.conventions import SH_C0, Bools, Float64s, Uint8s
 
 
 def read_points(path: Path) -> tuple[Float64s, Uint8s]:
@@ -70,7 +70,7 @@ def cloud_in(folders: list[Path]) -> Path | None:
 
 def share_seen(points: Float64s, cameras: list[Camera]) -> float:
     """Mean share of the cameras that have a point in their picture, walls disregarded."""
-    return float(_sightings(points, cameras).sum()) / max(1, len(points) * len(cameras))
+    return sum(np.count_nonzero(in_picture(points, camera)) for camera in cameras) / max(1, len(points) * len(cameras))
 
 
 # Points of a scene that comes without.
@@ -101,16 +101,8 @@ def random_points(cameras: list[Camera]) -> Float64s:
     rays = np.c_[x, y, np.ones(count)]
     local = rays * (2 * distance * away)[:, None]
     points = centres[chosen] + np.einsum("pij,pj->pi", rotations.as_matrix()[chosen], local)
-    order = np.argsort(-_sightings(points, cameras), kind="stable")
-    return np.asarray(points[order[:RANDOM_POINTS]])
-
-
-def _sightings(points: Float64s, cameras: list[Camera]) -> Int64s:
-    """Number of cameras ``[P]`` that have each point in their picture."""
-    seen = np.zeros(len(points), np.int64)
-    for camera in cameras:
-        seen += in_picture(points, camera)
-    return seen
+    sightings = np.sum([in_picture(points, camera) for camera in cameras], axis=0)
+    return np.asarray(points[np.argsort(-sightings, kind="stable")[:RANDOM_POINTS]])
 
 
 def in_picture(points: Float64s, camera: Camera) -> Bools:
