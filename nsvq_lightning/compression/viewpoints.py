@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import logsigmoid, normalize
 
 from nsvq_lightning.data.images import ImageStore, Picture
 from nsvq_lightning.data.points import in_picture
@@ -75,8 +76,8 @@ class Measure:
         self._expected = pictures(original, self.cameras, antialiased)
         if not any(bool(picture.any()) for picture in self._expected):
             raise ValueError(
-                f"all {len(self.cameras)} pictures of the scene are black, so no error can be measured: photos "
-                "(--data.root) must be of this scene, in its coordinates"
+                f"all {len(self.cameras)} pictures of the scene are black, so no error can be measured: its splats are "
+                "transparent, or photos (--data.root) are of another scene or in other coordinates"
             )
 
     def error(self, splats: SplatTensors) -> float:
@@ -210,11 +211,10 @@ def likely_cameras(splats: SplatTensors, count: int, width: int = 560, height: i
         width: Pixels.
         height: Pixels.
     """
-    raw = detached(splats)
-    means = raw.means.double().cpu().numpy()
-    # Small, opaque splats are where the detail is.
-    detail = torch.sigmoid(raw.opacities).double() * torch.exp(-raw.scales.double().mean(1))
-    weights = (detail / detail.sum()).cpu().numpy()
+    raw = RawSplats(*(tensor.cpu() for tensor in detached(splats)))
+    means = raw.means.double().numpy()
+    # Small, opaque splats are where the detail is: opacity / size, of a sum of 1 even where all are transparent.
+    weights = torch.softmax(logsigmoid(raw.opacities.double()) - raw.scales.double().mean(1), 0).numpy()
     middle = weights @ means
     reach = math.sqrt(weights @ ((means - middle) ** 2).sum(1)) or 1.0
     even: Tensor = torch.quasirandom.SobolEngine(7, scramble=True, seed=0).draw(5 * count)  # type: ignore[no-untyped-call]
@@ -246,23 +246,24 @@ def _following(splats: RawSplats, places: Float64s) -> Float64s:
     if not splats.shN.any():
         return np.ones(len(places))
     cells = np.array_split(spatial_order(splats.means.numpy()), min(CELLS, len(splats.means)))
-    opacities, found = splats.opacities.double().sigmoid() + 1e-30, np.zeros(len(places))
+    found = np.zeros(len(places))
     for cell in cells:
-        weights, shN = opacities[cell] / opacities[cell].sum(), splats.shN[cell].double()
+        weights, shN = torch.softmax(logsigmoid(splats.opacities[cell].double()), 0), splats.shN[cell].double()
         shN = shN / shN.square().sum((1, 2), keepdim=True).sqrt().clamp_min(1e-12)
         mean = torch.einsum("n,nic,njc->ij", weights, shN, shN)
         # Not singular, and the less sharp the more noise there is.
         mean += (0.02 * mean.diagonal().mean() + 1e-9) * torch.eye(len(mean))
-        lines = torch.nn.functional.normalize(weights @ splats.means[cell].double() - torch.from_numpy(places))
+        lines = normalize(weights @ splats.means[cell].double() - torch.from_numpy(places))
         basis = sh_basis(lines, sh_degree_of(splats.shN))[:, 1:].T
-        found += 1 / (basis * torch.linalg.solve(mean, basis)).sum(0).numpy()
+        # Infinite is only that of a place in the middle of the cell.
+        found += (basis * torch.linalg.solve(mean, basis)).sum(0).reciprocal().nan_to_num(posinf=0).numpy()
     return found / len(cells)
 
 
 def _size_variances(splats: RawSplats, places: Float64s) -> Float64s:
     """Variance of the logarithm of the splats' sizes in pixels as seen from each place ``[P]``, weighted by opacity."""
     few = RawSplats(*(spread(tensor, SOME_SPLATS) for tensor in splats))
-    weights = few.opacities.sigmoid() / few.opacities.sigmoid().sum()
+    weights = torch.softmax(logsigmoid(few.opacities), 0)
     sizes = few.scales.mean(1) - torch.cdist(torch.from_numpy(places).float(), few.means).clamp_min(1e-12).log()
     return ((sizes - (sizes @ weights)[:, None]).square() @ weights).double().numpy()
 

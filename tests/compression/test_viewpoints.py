@@ -61,11 +61,13 @@ def test_the_same_scene_has_the_same_views_and_the_best_come_first() -> None:
     assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(once, again, strict=True))
 
 
-def test_a_single_splat_and_one_above_another_have_views() -> None:
+@pytest.mark.parametrize("rows", [slice(0, 1), slice(0, 41, 40), slice(None)])
+@pytest.mark.parametrize("opacity", [3.0, -1000.0])
+def test_a_single_splat_one_above_another_and_transparent_ones_have_views(rows: slice, opacity: float) -> None:
     splats = painting(behind=False)
-    for rows in (slice(0, 1), slice(0, 41, 40)):
-        cameras = likely_cameras(RawSplats(*(tensor[rows] for tensor in splats)), 3, 32, 24)
-        assert all(camera.viewmat.isfinite().all() for camera in cameras)
+    shN, opacities = torch.ones(len(splats.means), 3, 3), torch.full_like(splats.opacities, opacity)
+    some = RawSplats(*(tensor[rows] for tensor in splats._replace(shN=shN, opacities=opacities)))
+    assert all(camera.viewmat.isfinite().all() for camera in likely_cameras(some, 3, 32, 24))
 
 
 def test_pictures_of_a_scene_are_its_photos() -> None:
