@@ -14,7 +14,9 @@ log = logging.getLogger(__name__)
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 
-def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool = False) -> dict[str, Path]:
+def locate(
+    names: Sequence[str], folder: Path, source: str, allow_outside: bool = False, others: Iterable[Path] = ()
+) -> dict[str, Path]:
     """The file of each photo or mask.
 
     A name that is no file is taken for the one that differs least: in capitals or Unicode form, then in its suffix.
@@ -25,6 +27,7 @@ def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool 
         folder: Where they are.
         source: The model, for messages.
         allow_outside: Also read files that are not in the scene folder.
+        others: Files that are something else, however near their names are.
 
     Returns:
         Paths by name, of which those of missing files do not exist.
@@ -36,7 +39,7 @@ def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool 
     exact = {name for name, path in paths.items() if (allow_outside or not is_outside(name)) and path.is_file()}
     if len(exact) == len(paths):
         return paths
-    taken = {paths[name] for name in exact}
+    taken = {*others, *(paths[name] for name in exact)}
     free = [path for path in photos_below(folder) if path not in taken]
     files = _Files(folder, free, whole=bool(exact))
     used: dict[Path, str] = {}
@@ -45,9 +48,9 @@ def locate(names: Sequence[str], folder: Path, source: str, allow_outside: bool 
         if not fitting:
             check_name(name, source, allow_outside)
             continue
-        path, *others = fitting
-        if others:
-            raise SceneError(f"{source} names {name}, which may be {path} or {others[0]}: remove or rename one")
+        path, *rivals = fitting
+        if rivals:
+            raise SceneError(f"{source} names {name}, which may be {path} or {rivals[0]}: remove or rename one")
         if path in used:
             raise SceneError(f"{source} names {used[path]} and {name}, but there is only {path}: copy both")
         used[path] = name

@@ -73,9 +73,7 @@ def _files_in(root: Path) -> list[Path]:
     single, train, test, val = (root / f"transforms{part}.json" for part in ("", "_train", "_test", "_val"))
     if single.is_file():
         return [single]
-    if not train.is_file():
-        return []
-    return [path for path in (train, test, val) if path.is_file()][:2]
+    return [path for path in (train, test, val) if path.is_file()][:2] if train.is_file() else []
 
 
 def _with_colmap_points(poses: ColmapModel, root: Path) -> ColmapModel:
@@ -279,10 +277,9 @@ def _frames(file: Path, allow_outside: bool) -> tuple[Json, dict[str, _Frame]]:
         if not frame.path("file_path"):
             raise frame.error("has no file_path")
         given.append(frame)
-    photos, masks = (
-        locate([path for frame in given if (path := frame.path(key))], file.parent, str(file), allow_outside)
-        for key in ("file_path", "mask_path")
-    )
+    named, masked = ([path for frame in given if (path := frame.path(key))] for key in ("file_path", "mask_path"))
+    photos = locate(named, file.parent, str(file), allow_outside)
+    masks = locate(masked, file.parent, str(file), allow_outside, photos.values())
     frames = {}
     for frame in given:
         frame = replace(frame, photo=photos[frame.path("file_path")], mask=masks.get(frame.path("mask_path")))

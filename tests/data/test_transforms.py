@@ -204,6 +204,7 @@ def test_a_colmap_model_comes_first_and_any_can_be_chosen(make_scene: SceneFacto
         ({"file_path": "/etc/a.png"}, {}, r"names /etc/a\.png, which is"),
         ({"file_path": "..\\a.png"}, {}, r"names \.\./a\.png, which is"),
         ({"mask_path": "../m.png"}, {}, r"names \.\./m\.png, which is"),
+        ({"mask_path": "masks/000.png"}, {}, r"1 masks do not exist, first .*masks/000\.png"),
         ({"file_path": "\udcff.png"}, {}, "which is not UTF-8"),
         ({}, {"ply_file_path": "../a.ply"}, r"path in .* names \.\./a\.ply"),
     ],
