@@ -63,25 +63,25 @@ ROUNDED = 0.01
 
 def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether two sizes (width, height) have one aspect ratio, up to rounding of a side to a pixel of the first."""
-    difference = abs(one[0] * other[1] - one[1] * other[0])
-    return difference < max(ROUNDED * one[1] * other[0], *other)
+    return abs(one[0] * other[1] - one[1] * other[0]) < max(ROUNDED * one[1] * other[0], *other)
 
 
-def head_for(path: Path, expected: tuple[int, int]) -> ImageHead:
+def head_for(path: Path, expected: tuple[int, int], as_shown: bool = False) -> ImageHead:
     """The head of a photo for a camera of some size: with the orientation to apply, and the size that it then has.
 
     Args:
         path: Image file; of one that cannot be read, the head is as expected.
         expected: Width and height of the camera, pixels.
+        as_shown: Whether other photos say that the cameras are of photos as their EXIF orientation shows them.
     """
     try:
         size, orientation, has_alpha = image_head(path)
     except SceneError:
         return ImageHead(expected, 1, False)  # it is left out once its pixels are missed
     # COLMAP calibrates photos as they are stored, other programs as their EXIF orientation shows them.
-    turned = size[::-1]
-    if orientation >= ON_ITS_SIDE and same_shape(turned, expected) and not same_shape(size, expected):
-        return ImageHead(turned, orientation, has_alpha)
+    shown = size[::-1] if orientation >= ON_ITS_SIDE else size
+    if same_shape(shown, expected) and (as_shown or not same_shape(size, expected)):
+        return ImageHead(shown, orientation, has_alpha)
     return ImageHead(size, 1, has_alpha)
 
 

@@ -274,19 +274,17 @@ def _image_sources(
     model: ColmapModel, paths: list[Path], masks: list[Path | None], divisor: int, max_width: int | None
 ) -> list[ImageSource]:
     """One source per view; views with the same camera and file size share their undistortion."""
-    heads = []
-    kinds = []
-    others = 0
-    for image, path in zip(model.images, paths, strict=True):
-        camera = model.cameras[image.camera_id]
-        head = head_for(path, (camera.width, camera.height))
-        heads.append(head)
-        kinds.append((image.camera_id, head.size))
-        others += not same_shape(head.size, (camera.width, camera.height))
-    if turned := sum(head.orientation != 1 for head in heads):
+    used = [model.cameras[image.camera_id] for image in model.images]
+    sized = [(path, (camera.width, camera.height)) for path, camera in zip(paths, used, strict=True)]
+    heads = [head_for(*each) for each in sized]
+    if any(head.orientation != 1 for head in heads):
+        # The program followed EXIF, so it did where that changes no shape, too.
+        heads = [head_for(*each, as_shown=True) for each in sized]
+        turned = sum(head.orientation != 1 for head in heads)
         log.info("%d of %d photos are turned by their EXIF orientation, as their cameras are", turned, len(heads))
-    if others:
+    if others := sum(not same_shape(head.size, size) for head, (_, size) in zip(heads, sized, strict=True)):
         log.warning("%d of %d photos %s", others, len(heads), OTHER_SHAPE)
+    kinds = [(image.camera_id, head.size) for image, head in zip(model.images, heads, strict=True)]
     keep_maps = len(set(kinds)) <= MAX_CAMERAS_WITH_MAPS
     lenses = {}
     for kind in dict.fromkeys(kinds):
@@ -399,8 +397,7 @@ def astray(places: Float64s, times: float) -> Bools:
 def _camera(image: ColmapImage, lens: Pinhole, frame: Frame) -> Camera:
     pose = torch.from_numpy(image.viewmat)
     try:
-        camera = Camera(torch.from_numpy(lens.K), pose, lens.width, lens.height, frame.near)
-        return camera.to(dtype=torch.float32)
+        return Camera(torch.from_numpy(lens.K), pose, lens.width, lens.height, frame.near).to(dtype=torch.float32)
     except ValueError as error:
         raise SceneError(f"camera {image.camera_id} of image {image.name}: {error}; run COLMAP again") from error
 

@@ -513,6 +513,25 @@ def test_photos_are_turned_where_their_cameras_are(
     assert load_scene(make_scene("stored", views=2)).images.sources[0].orientation == 1
 
 
+@pytest.mark.parametrize("orientation", [2, 3, 4])
+def test_photos_that_keep_their_shape_are_turned_where_others_are(make_scene: SceneFactory, orientation: int) -> None:
+    """What one photo says of the program holds for all."""
+    root = make_scene(views=3, size=(32, 40))
+    pixels = np.zeros((40, 32, 3), np.uint8)
+    pixels[:8, :20] = 250, 10, 10
+    for number in range(3):
+        tags = PIL.Image.Exif()
+        tags[274] = (orientation, 6, 1)[number]
+        stored = pixels.transpose(1, 0, 2) if number == 1 else pixels
+        PIL.Image.fromarray(stored).save(root / f"images/00{number}.png", "JPEG", quality=95, exif=tags)
+    scene = load_scene(root)
+    assert [source.orientation for source in scene.images.sources] == [orientation, 6, 1]
+    for number in range(3):
+        with PIL.Image.open(root / f"images/00{number}.png") as photo:
+            shown = np.asarray(PIL.ImageOps.exif_transpose(photo)).astype(int)
+        assert np.abs(scene.view(number).image.numpy() - shown).max() < 25
+
+
 def test_some_rows_are_spread_over_all() -> None:
     assert spread(range(10), 4) == range(0, 10, 3)
     assert spread((), 4) == ()
