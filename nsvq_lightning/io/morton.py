@@ -47,18 +47,21 @@ class Grid:
         """The grid for positions ``[N, 3]`` whose cells may be at most ``widest [N]`` wide.
 
         Its cells are small enough for all but the smallest thousandth of splats, yet not below 2⁻²⁰ of the extent of
-        all but the outermost thousandth at either end of each axis; so the cube holds all but a few far splats.
+        all but the outermost thousandth at either end of each axis; so the cube holds all but a few far splats. Where
+        that is too coarse for half of the splats, more are outside, up to a quarter.
         """
         if len(means) == 0:
             return cls(1.0, (0, 0, 0))
-        low, high = np.quantile(means.astype(np.float64), (0.001, 0.999), axis=0)
-        extent = max(float((high - low).max()), float(np.abs(means).max()) * 2.0**-40, 1e-30)
-        finest = power_above(extent * 2.0 ** (1 - AXIS_BITS))  # the scene takes up to half of each side of the grid
+        for far in (0.001, 0.02, 0.25):
+            low, high = np.quantile(means.astype(np.float64), (far, 1 - far), axis=0)
+            extent = max(float((high - low).max()), float(np.abs([low, high]).max()) * 2.0**-40, 1e-30)
+            finest = power_above(extent * 2.0 ** (1 - AXIS_BITS))  # the scene takes up to half of each side of the grid
+            if finest <= np.median(widest):
+                break
         step = power_below(max(float(np.quantile(widest, 0.001)), finest))
         # Cells up to a quarter of the grid lie on multiples of their own width, whichever scene it was made for.
         quarter = 1 << AXIS_BITS - 2
-        middle = (low + high) / 2 / step
-        base = np.rint((middle - 2 * quarter) / quarter).astype(np.int64) * quarter
+        base = np.rint(((low + high) / 2 / step - 2 * quarter) / quarter).astype(np.int64) * quarter
         return cls(step, tuple(base.tolist()))
 
     def cells(self, means: Float32s) -> tuple[Int64s, Bools]:
@@ -74,8 +77,7 @@ class Grid:
     def centers(self, cells: Int64s, depths: Int64s) -> Float32s:
         """Centre of the cell of ``depths [N]`` bits that holds each cell ``[N, 3]``, scene units."""
         shift = (AXIS_BITS - depths)[:, None]
-        corners = cells >> shift << shift
-        middles = corners + 0.5 * (np.int64(1) << shift) + self.base
+        middles = (cells >> shift << shift) + 0.5 * (np.int64(1) << shift) + self.base
         return (middles * self.step).astype(np.float32)
 
 

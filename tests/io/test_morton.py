@@ -51,6 +51,17 @@ def test_far_splats_do_not_make_the_grid_coarse() -> None:
     assert grid.step == near.step == 2.0**-10
 
 
+@pytest.mark.parametrize(("share", "most"), [(0.002, 0.002), (0.04, 0.04), (0.4, 0.4)])
+def test_many_very_far_splats_do_not_make_the_grid_coarse_either(share: float, most: float) -> None:
+    means = np.random.default_rng(4).standard_normal((5000, 3)).astype(np.float32)
+    means[: int(share * 5000)] *= 1e7
+    means[-1] = 3e38
+    widest = np.full(5000, 1e-3)
+    grid = Grid.around(means, widest)
+    assert grid.step <= 1e-3
+    assert 1 - grid.cells(means)[1].mean() <= most + 0.001
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 400])
 def test_neighbours_are_the_two_nearest_of_the_rows_before(count: int) -> None:
     cells = np.random.default_rng(count).integers(0, 60, (count, 3))
