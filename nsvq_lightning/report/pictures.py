@@ -131,10 +131,14 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
         video = cv2.VideoWriter(str(first), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
         if not video.isOpened():
             raise OSError(f"OpenCV cannot write {code} here: write PNGs into a folder")
+        frames: list[object] = []
         try:
-            yield lambda rgb: video.write(np.ascontiguousarray(rgb[:, :, ::-1]))
+            yield lambda rgb: frames.append(video.write(np.ascontiguousarray(rgb[:, :, ::-1])))
         finally:
             video.release()
+        # OpenCV itself says nothing where it could not write.
+        if cv2.VideoCapture(str(first)).get(cv2.CAP_PROP_FRAME_COUNT) < len(frames):
+            raise OSError(f"{path} could not be written: has the disk room for it?")
         if program:
             options = ["-c:v", "libx264", "-crf", "17", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
             command = [program, "-loglevel", "error", "-i", str(first), *options, str(file)]

@@ -53,6 +53,37 @@ def test_pictures_come_back_from_the_video(tmp_path: Path, codec: str, caplog: p
     assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
 
 
+def test_what_opencv_could_not_write_is_no_video(tmp_path: Path, codec: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a full disk, of which OpenCV says nothing."""
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"old")
+    writer = cv2.VideoWriter
+    frames = iter(range(3))
+
+    class Full:
+        fourcc = staticmethod(writer.fourcc)
+
+        def __init__(self, *arguments: Any) -> None:
+            self._writer = writer(*arguments)
+            self.isOpened, self.release = self._writer.isOpened, self._writer.release
+
+        def write(self, picture: np.ndarray) -> None:
+            if next(frames, None) is not None:
+                self._writer.write(picture)
+
+    monkeypatch.setattr(cv2, "VideoWriter", Full)
+
+    def written() -> None:
+        with video_writer(path, 64, 48, 12.0) as add:
+            for picture in _pictures():
+                add(picture)
+
+    with pytest.raises(OSError, match=r"a\.mp4 could not be written: has the disk room"):
+        written()
+    assert path.read_bytes() == b"old"
+    assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
+
+
 def test_an_error_leaves_the_old_video(tmp_path: Path, codec: str) -> None:
     path = tmp_path / "a.mp4"
     path.write_bytes(b"old")
