@@ -126,6 +126,8 @@ def read_camera_path(path: Path) -> tuple[list[Camera], float]:
     """
     with _refused(f"{path} is not a camera path as nerfstudio and the viewer write them"):
         content = json.loads(path.read_bytes())
+        if (kind := content.get("camera_type", "perspective")) != "perspective":
+            raise ValueError(f"its camera_type is {kind}, and only perspective can be rendered")
         entries = content.get("camera_path") or content["keyframes"]
         size = int(content["render_width"]), int(content["render_height"])
         cameras = [_entry_camera(entry, *size) for entry in entries]

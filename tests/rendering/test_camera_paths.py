@@ -164,6 +164,7 @@ def test_nerfstudio_paths_are_read(tmp_path: Path, form: str) -> None:
         ('{"keyframes": [], "render_width": 4, "render_height": 3}', "it has no cameras"),
         ('{"keyframes": [{}], "render_width": 4, "render_height": 3}', "lacks 'matrix'"),
         ('{"keyframes": [{}]}', "lacks 'render_width'"),
+        ('{"camera_type": "equirectangular", "keyframes": []}', "camera_type is equirectangular, and only perspective"),
         ('{"keyframes": [{"matrix": [1], "fov": 50}], "render_width": 4, "render_height": 3}', "reshape"),
     ],
 )
