@@ -25,8 +25,8 @@ class Camera:
             machine.
 
     Raises:
-        ValueError: A matrix has another shape, the image is empty, the focal lengths or ``near`` are not positive and
-            finite, or there is skew.
+        ValueError: A matrix has another shape or kind, the image is empty, or the focal lengths or ``near`` are not
+            positive and finite.
     """
 
     K: Tensor
@@ -43,16 +43,22 @@ class Camera:
                 raise ValueError(f"Camera.{name} must have shape [{side}, {side}], got {list(matrix.shape)}")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"Camera needs at least one pixel, got {self.width}x{self.height}")
-        fx, fy = float(self.K[0, 0]), float(self.K[1, 1])
+        K = self.K.tolist()
+        (fx, _, cx), (_, fy, cy), _ = K
         # Kept as Python floats: reading them from an accelerator would stall it at every render.
-        intrinsics = fx, fy, float(self.K[0, 2]), float(self.K[1, 2])
+        intrinsics = fx, fy, cx, cy
         vars(self).update(intrinsics=intrinsics, packed_view=_packed(self.viewmat))
-        if not (0 < fx < math.inf and 0 < fy < math.inf):
-            raise ValueError(f"Camera.K needs positive, finite focal lengths, got fx={fx}, fy={fy}")
+        if not (all(map(math.isfinite, intrinsics)) and min(fx, fy) > 0):
+            raise ValueError(f"Camera.K needs positive, finite focal lengths and a finite centre, got {intrinsics}")
         if not 0 < self.near < math.inf:
             raise ValueError(f"Camera.near must be positive and finite, got {self.near}")
-        if self.K[0, 1] != 0:
-            raise ValueError(f"Camera.K must be without skew, got {float(self.K[0, 1])}: no back-end renders it")
+        if [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] != K:
+            raise ValueError(f"Camera.K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew, got {K}")
+        turn = self.viewmat.detach().to("cpu", torch.float64, copy=True)
+        turn[:3, 3] *= 0  # what is not finite stays so
+        if not ((turn @ turn.T - torch.eye(4)).abs().max() < 0.01 and turn.det() > 0):
+            shape = "a rotation and a translation, over 0 0 0 1: is it transposed, mirrored or scaled?"
+            raise ValueError(f"Camera.viewmat must be world to camera, {shape}")
 
     @property
     def size(self) -> tuple[int, int]:

@@ -79,7 +79,7 @@ def render(
     splats = _checked(splats)
     stored = sh_degree_of(splats.shN)
     degree = stored if sh_degree is None else sh_degree
-    if not 0 <= degree <= stored:
+    if degree not in range(stored + 1):
         raise ValueError(f"sh_degree must be between 0 and the stored degree {stored}, got {sh_degree}")
     means = splats.means
     if background is None:
@@ -100,7 +100,7 @@ def render(
     elif sampling is not None:
         view_sampling = _sampling(means, camera, sampling)
     image, alpha, radii, means2d, depth = _module_of(backend, means).render(
-        splats, camera, degree, background, pixel_weights, absgrad, view_sampling
+        splats, camera, int(degree), background, pixel_weights, absgrad, view_sampling
     )
     return Render(image, alpha, radii, means2d, depth, absgrad)
 
@@ -128,6 +128,8 @@ def _checked(splats: SplatTensors) -> RawSplats:
     tensors = {name: getattr(splats, name).contiguous() for name in ATTRIBUTES}
     check_shapes(tensors)
     kinds = {name: (tensor.dtype, tensor.device) for name, tensor in tensors.items()}
+    if kinds["means"][0] not in (torch.float32, torch.float64):
+        raise ValueError(f"splats must be float32 or float64 to be rendered, got {kinds['means'][0]}")
     for name, kind in kinds.items():
         if kind != kinds["means"]:
             expected = " on ".join(map(str, kinds["means"]))

@@ -274,13 +274,43 @@ def test_attributes_that_do_not_belong_together_are_refused(name: str) -> None:
 def test_cameras_that_no_back_end_renders_are_refused() -> None:
     camera = front_camera()
     for entry, value, message in (
-        ((0, 1), 30.0, "without skew, got 30.0"),
+        ((0, 1), 30.0, r"without skew, got \[\[.*30.0"),
         ((0, 0), math.inf, "positive, finite focal"),
     ):
         K = camera.K.clone()
         K[entry] = value
         with pytest.raises(ValueError, match=message):
             Camera(K, camera.viewmat, camera.width, camera.height)
+
+
+def test_cameras_that_are_not_rigid_are_refused() -> None:
+    """Such as INRIA's transposed ``world_view_transform``."""
+    camera = front_camera()
+    rigid = camera.viewmat.clone()
+    rigid[:3, 3] = torch.tensor([0.1, 0.2, 3.0])
+    assert Camera(camera.K, rigid, 4, 3).packed_view[9:12] == pytest.approx((0.1, 0.2, 3.0))
+    mirrored, scaled = torch.diag(torch.tensor([-1.0, 1, 1, 1])), torch.diag(torch.tensor([2.0, 2, 2, 1]))
+    unknown = rigid.clone()
+    unknown[1, 3] = math.nan
+    for wrong in (rigid.T, rigid @ mirrored, rigid @ scaled, unknown):
+        with pytest.raises(ValueError, match=r"viewmat must be world to camera.* transposed, mirrored or scaled"):
+            Camera(camera.K, wrong, 4, 3)
+    for entry, value in (((2, 2), 2.0), ((1, 0), 5.0), ((0, 2), math.nan)):
+        K = camera.K.clone()
+        K[entry] = value
+        with pytest.raises(ValueError, match=r"Camera\.K"):
+            Camera(K, rigid, 4, 3)
+
+
+def test_degrees_and_types_that_cannot_be_rendered_are_refused() -> None:
+    splats, camera = random_splats(20), front_camera()
+    whole = render(splats, camera, sh_degree=1).image
+    assert torch.equal(render(splats, camera, sh_degree=torch.tensor(1)).image, whole)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="sh_degree must be between 0 and the stored degree"):
+        render(splats, camera, sh_degree=0.5)  # type: ignore[arg-type]
+    for dtype in (torch.bfloat16, torch.float16):
+        with pytest.raises(ValueError, match=f"float32 or float64 to be rendered, got {dtype}"):
+            render(type(splats)(*(tensor.to(dtype) for tensor in splats)), camera)
 
 
 @pytest.mark.parametrize("sh_degree", [0, 2])
