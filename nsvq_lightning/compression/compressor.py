@@ -241,8 +241,7 @@ class Compressor:
     def _row_weights(self, setting: Setting) -> Tensor:
         """How much each splat counts where harmonics are put on a basis ``[N]``."""
         splats = self._trained(setting).tensors()
-        contribution = importance.contributions(splats, self.cameras, self._render)
-        return importance.row_weights(contribution).sqrt()
+        return importance.row_weights(importance.contributions(splats, self.cameras, self._render)).sqrt()
 
     def error(self, candidate: Candidate) -> float:
         """Root mean square difference between its pictures and those of the original, for channels in [0, 1]."""
@@ -464,6 +463,7 @@ class Compressor:
 NERFSTUDIO = {"features_dc": "sh0", "features_rest": "shN"}
 
 
+@torch.inference_mode(False)
 def compress(
     splats: CompressedScene | SplatTensors | Mapping[str, Tensor] | ParameterDict,
     cameras: Sequence[Camera] = (),
@@ -499,13 +499,19 @@ def compress(
         scene = splats
     else:
         named = splats if isinstance(splats, Mapping | ParameterDict) else detached(splats)._asdict()
-        rows = {NERFSTUDIO.get(name, name): tensor.detach().cpu().numpy() for name, tensor in named.items()}
+        # Also of arrays and bfloat16.
+        rows = {
+            NERFSTUDIO.get(name, name): torch.as_tensor(values).detach().cpu().float().numpy()
+            for name, values in named.items()
+        }
+        if missing := set(ATTRIBUTES) - {"shN"} - rows.keys():
+            raise ValueError(f"the splats have no {', '.join(sorted(missing))}")
         scene = CompressedScene.from_rows(rows, antialiased)
     scene = scene.finite()
     if cameras:
         check_cameras(cameras, scene.means)
         scene = replace(scene, cameras=trained_by(cameras))
-    splats = scene.tensors()
-    views = own_scene(splats, cameras, scene.antialiased, photos) if photos else None
+    views = own_scene(scene.tensors(), cameras, scene.antialiased, photos) if photos else None
     compressor = Compressor(scene, cameras, views, **settings)
-    return compressor.best(min(left or len(scene), len(scene)), codebooks, target_bytes, max_error).scene
+    left = len(scene) if left is None else min(left, len(scene))
+    return compressor.best(left, codebooks, target_bytes, max_error).scene

@@ -129,11 +129,13 @@ class CompressedScene:
         if antialiased:
             header["config"] = {"antialiased": True}
         found = {"shN": np.zeros((len(rows["means"]), 0), np.float32)}
+        if "shN" in rows and rows["shN"].ndim == 3 and rows["shN"].shape[2] != 3:
+            raise ValueError(f"shN must have shape [N, (degree + 1)^2 - 1, 3], got {list(rows['shN'].shape)}")
         for name, values in rows.items():
             found[name] = np.ascontiguousarray(values, np.float32).reshape(len(values), math.prod(values.shape[1:]))
         return cls(
             found["means"],
-            found["opacities"][:, 0],
+            found["opacities"].ravel(),
             raw={name: found[name] for name in splat.QUANTIZABLE if name in found},
             sh_degree=shN_degree(found["shN"].shape[1] // 3),
             **header,

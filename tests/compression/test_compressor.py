@@ -172,6 +172,31 @@ def test_an_error_does_not_depend_on_the_unit_of_the_scene(scale: float) -> None
     assert errors[1] == pytest.approx(errors[0], rel=0.2)
 
 
+def test_what_is_no_scene_is_refused() -> None:
+    splats = ball(300).tensors()._asdict()
+    for change, words in (
+        ({"shN": torch.zeros(300, 3, 8)}, r"shN must have shape \[N, .*, 3\], got \[300, 3, 8\]"),
+        ({"opacities": splats["opacities"][:, None].expand(-1, 2)}, r"opacities must have shape \[300\]"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            nl.compress({**splats, **change}, steps=4)
+    with pytest.raises(ValueError, match="the splats have no quats, scales"):
+        nl.compress({name: splats[name] for name in ("means", "opacities", "sh0")}, steps=4)
+    with pytest.raises(ValueError, match="splats must be at least 1, got 0"):
+        nl.compress(splats, left=0, codebooks="0.5k", steps=4)
+
+
+def test_a_scene_is_compressed_of_bfloat16_arrays_and_in_inference_mode() -> None:
+    scene = ball(300)
+    cameras = cameras_around(scene.means, 3, 80, 60)
+    rows = {name: tensor.bfloat16() for name, tensor in scene.tensors()._asdict().items()}
+    arrays = {name: tensor.float().numpy() for name, tensor in rows.items()}
+    found = [nl.compress(given, cameras, codebooks="0.5k", steps=4) for given in (rows, arrays)]
+    with torch.inference_mode():
+        found.append(nl.compress(rows, cameras, codebooks="0.5k", steps=4))
+    assert len({each.codes["shN"].tobytes() for each in found}) == 1
+
+
 def test_minutes_limit_the_steps() -> None:
     scene = ball(300)
     cameras = cameras_around(scene.means, 3, 80, 60)
