@@ -90,9 +90,7 @@ class Finding(NamedTuple):
 
 def judged(subject: str, text: str, advice: str, *, when: bool) -> Finding:
     """A note with the advice when something is not as it should be, otherwise good."""
-    if when:
-        return Finding("note", subject, f"{text}: {advice}")
-    return Finding("good", subject, text)
+    return Finding("note", subject, f"{text}: {advice}") if when else Finding("good", subject, text)
 
 
 def attempt(subject: str, check: Iterator[Finding]) -> Iterator[Finding]:
@@ -282,6 +280,7 @@ def check_overlap(model: "ColmapModel") -> Iterator[Finding]:
 def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
     """Load the folder as a run does it, then check its split, its photos and their shape, and what a run will take."""
     from nsvq_lightning.data.images import same_shape
+    from nsvq_lightning.data.points import in_picture
     from nsvq_lightning.data.scene import ONE_PLACE, OTHER_SHAPE, load_scene
 
     scene = load_scene(root)
@@ -291,6 +290,13 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
     yield judged("split", text, advice, when=train < 20)
     if not scene.extent > 0:
         yield Finding("problem", "extent", f"all train photos {ONE_PLACE}")
+    if (seen := model.observations) is not None:
+        points = model.points - np.array(scene.frame.origin)
+        views = enumerate(scene.cameras)
+        shown = sum(np.count_nonzero(in_picture(points[seen[seen[:, 1] == row, 0]], view)) for row, view in views)
+        if 2 * shown < len(seen):
+            text = f"{1 - shown / len(seen):.0%} of the points are not in the pictures that they were found in"
+            yield Finding("problem", "poses", f"{text}: are poses camera to world, or quaternions xyzw?")
     cameras = [model.cameras[image.camera_id] for image in model.images]
     pairs = zip(cameras, scene.images.sources, strict=True)
     others = sum(not same_shape(source.size, (camera.width, camera.height)) for camera, source in pairs)

@@ -207,6 +207,19 @@ def test_a_larger_model_beside_the_first_is_a_problem(scene: Path) -> None:
     assert (finding.verdict, finding.text.partition(":")[0]) == ("problem", "sparse/0 has 8 images, sparse/1 has 9")
 
 
+def test_poses_that_contradict_what_was_seen_are_a_problem(scene: Path) -> None:
+    """Camera to world instead of world to camera, the commonest mistake in models that people write themselves."""
+    pycolmap = import_pycolmap()
+    reconstruction = pycolmap.Reconstruction(str(scene / "sparse/0"))
+    for image in reconstruction.images.values():
+        image.frame.set_cam_from_world(image.camera_id, image.cam_from_world().inverse())
+    assert "poses" not in _by_subject(scene)
+    reconstruction.write_binary(str(scene / "sparse/0"))
+    finding = _by_subject(scene)["poses"]
+    assert finding.verdict == "problem"
+    assert "not in the pictures that they were found in: are poses camera to world" in finding.text
+
+
 def test_views_that_share_too_little_are_named(scene: Path) -> None:
     model = read_model(scene, observations=True)
     assert model.observations is not None
