@@ -13,7 +13,7 @@ from nsvq_lightning.data.images import ImageStore, Picture
 from nsvq_lightning.data.points import in_picture
 from nsvq_lightning.data.scene import Scene, spread
 from nsvq_lightning.io.morton import spatial_order
-from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.camera import Camera, camera_of
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
 from nsvq_lightning.rendering.poses import poses, view_towards
@@ -40,9 +40,8 @@ def look_at(target: Float64s, eye: Float64s, width: int, height: int, angle: flo
     """
     view = view_towards(target, eye, np.array([0.0, -1.0, 0.0]))
     focal = 0.5 * width / math.tan(angle / 2)
-    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
-    near = NEARNESS * float(np.linalg.norm(target - eye))
-    return Camera(intrinsics, view, width, height, near or NEAR)
+    near = NEARNESS * float(np.linalg.norm(target - eye)) or NEAR
+    return camera_of(view, (focal, focal, width / 2, height / 2), width, height, near)
 
 
 @torch.no_grad()
@@ -245,7 +244,7 @@ def _following(splats: RawSplats, places: Float64s) -> Float64s:
     """
     if not splats.shN.any():
         return np.ones(len(places))
-    cells = np.array_split(spatial_order(splats.means.numpy()), min(CELLS, len(splats.means)))
+    cells = np.array_split(spatial_order(splats.means.numpy()), CELLS)
     found = np.zeros(len(places))
     for cell in cells:
         weights, shN = torch.softmax(logsigmoid(splats.opacities[cell].double()), 0), splats.shN[cell].double()
@@ -273,5 +272,4 @@ def _detail(splats: SplatTensors, camera: Camera) -> float:
     """Mean difference between neighbouring pixels, times the share of the picture that is covered."""
     view = render(splats, camera)
     image = view.image.clamp(0, 1)
-    differences = [image.diff(dim=dim).abs().mean() for dim in (0, 1)]
-    return float(sum(differences) * view.alpha.mean())
+    return float(sum(image.diff(dim=dim).abs().mean() for dim in (0, 1)) * view.alpha.mean())

@@ -40,8 +40,7 @@ class _VectorType(types.Type):
 
     def can_convert_from(self, typingctx, other):
         """A number where ``Lanes`` are expected is spread to every lane, if nothing else takes a number there."""
-        is_number = isinstance(other, types.Integer | types.Float)
-        return Conversion.unsafe if self == Lanes and is_number else None
+        return Conversion.unsafe if self == Lanes and isinstance(other, types.Integer | types.Float) else None
 
 
 Lanes = _VectorType("float32x16")

@@ -74,8 +74,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     harmonics = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
 
     def turned_harmonics(rows: Float32s) -> Arrays:
-        coefficients = rows.reshape(len(rows), len(harmonics), 3)
-        return (harmonics @ coefficients).reshape(rows.shape)
+        return (harmonics @ rows.reshape(len(rows), len(harmonics), 3)).reshape(rows.shape)
 
     has_origin = any(scene.origin)
     means = scene.means @ linear.T + (0 if has_origin else shift)
