@@ -292,8 +292,10 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
         yield Finding("problem", "extent", f"all train photos {ONE_PLACE}")
     if (seen := model.observations) is not None:
         points = model.points - np.array(scene.frame.origin)
-        views = enumerate(scene.cameras)
-        shown = sum(np.count_nonzero(in_picture(points[seen[seen[:, 1] == row, 0]], view)) for row, view in views)
+        shown = sum(
+            np.count_nonzero(in_picture(points[seen[seen[:, 1] == row, 0]], camera))
+            for row, camera in enumerate(scene.cameras)
+        )
         if 2 * shown < len(seen):
             text = f"{1 - shown / len(seen):.0%} of the points are not in the pictures that they were found in"
             yield Finding("problem", "poses", f"{text}: are poses camera to world, or quaternions xyzw?")

@@ -56,7 +56,7 @@ class Grid:
             low, high = np.quantile(means.astype(np.float64), (far, 1 - far), axis=0)
             extent = max(float((high - low).max()), float(np.abs([low, high]).max()) * 2.0**-40, 1e-30)
             finest = power_above(extent * 2.0 ** (1 - AXIS_BITS))  # the scene takes up to half of each side of the grid
-            if finest <= np.median(widest):
+            if not 0 < np.median(widest) < finest:
                 break
         step = power_below(max(float(np.quantile(widest, 0.001)), finest))
         # Cells up to a quarter of the grid lie on multiples of their own width, whichever scene it was made for.

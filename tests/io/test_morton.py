@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nsvq_lightning.io.morton import AXIS_BITS, Grid, morton_keys, nearest_before, unmorton
+from nsvq_lightning.io.morton import AXIS_BITS, Grid, morton_keys, nearest_before, spatial_order, unmorton
 
 
 def test_keys_interleave_the_bits() -> None:
@@ -60,6 +60,19 @@ def test_many_very_far_splats_do_not_make_the_grid_coarse_either(share: float, m
     grid = Grid.around(means, widest)
     assert grid.step <= 1e-3
     assert 1 - grid.cells(means)[1].mean() <= most + 0.001
+
+
+def test_splats_in_spatial_order_are_near_the_one_before() -> None:
+    """In a scene with two fifths of the splats far around it, and with some that are lost."""
+    means = np.random.default_rng(5).standard_normal((4000, 3)).astype(np.float32)
+    means[:1600] *= 20 / np.linalg.norm(means[:1600], axis=1, keepdims=True)
+    lost = means.copy()
+    lost[:3] = 1e6
+    for each in (means, lost):
+        order = spatial_order(each)
+        assert sorted(order) == list(range(4000))
+        steps = np.linalg.norm(np.diff(each[order], axis=0), axis=1)
+        assert np.quantile(steps, 0.95) < 10  # in random order 39
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 400])
