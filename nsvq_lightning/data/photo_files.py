@@ -144,7 +144,7 @@ def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]
         others = " and ".join(str(path.relative_to(root)) for path in found)
         raise (SceneError if found else NoPhotosError)(
             f"image folder {root / name} does not exist: copy the photos there, or set images_folder (or factor, for "
-            f"{name}_2, _4 and _8); they are in {others or 'no other folder'}"
+            f"{name}_2, _4 and _8); they are in {others or 'no other folder up to two levels down'}"
         )
     log.info("%s does not exist: photos are read from %s", root / name, found[0])
     return found[0], factor or 1

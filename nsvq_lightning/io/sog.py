@@ -167,7 +167,9 @@ class _Archive:
     def _bytes(self, name: str, most: int) -> bytes:
         entry = self._zip.NameToInfo.get(name)
         if entry is None:
-            raise FormatError(f"incomplete: there is no {name}", "copy all of its files again")
+            raise FormatError(
+                f"incomplete: there is no {name}", "copy all of its files again, or zip them without their folder"
+            )
         if entry.file_size > most:
             raise FormatError(f"damaged: {name} cannot have {entry.file_size} bytes")
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # whose length can be limited

@@ -271,7 +271,7 @@ def test_missing_image_folder(make_scene: SceneFactory) -> None:
     assert len(load_scene(root, images_folder="images_2")) == 9
     shutil.rmtree(root / "images_2")
     shutil.rmtree(root / "images_4")
-    with pytest.raises(SceneError, match=r"they are in no other folder$"):
+    with pytest.raises(SceneError, match=r"they are in no other folder up to two levels down$"):
         load_scene(root)
 
 
