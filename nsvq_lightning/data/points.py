@@ -101,7 +101,8 @@ def random_points(cameras: list[Camera]) -> Float64s:
     rays = np.c_[x, y, np.ones(count)]
     local = rays * (2 * distance * away)[:, None]
     points = centres[chosen] + np.einsum("pij,pj->pi", rotations.as_matrix()[chosen], local)
-    sightings = np.sum([in_picture(points, camera) for camera in cameras], axis=0)
+    # One after another: all pictures at once would take a byte for each point and camera.
+    sightings = sum(in_picture(points, camera).astype(int) for camera in cameras)
     return np.asarray(points[np.argsort(-sightings, kind="stable")[:RANDOM_POINTS]])
 
 
