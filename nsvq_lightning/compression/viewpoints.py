@@ -1,7 +1,7 @@
 """A scene's own pictures: from where it shows detail, and how far two pictures are apart."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -184,8 +184,6 @@ SOME_DETAIL = 250_000
 # Where they stand, in spreads of the detail from its middle: around a scene, or inside it up to this.
 AROUND = 0.9, 3.0
 INSIDE = 0.8
-# Places at the farthest distance decide: on four scenes of objects, colours follow the line of sight to the
-# middle 0.3 to 0.7 times as much as that to the best of them, in a room 1.75 times.
 # Power of how much colours follow the line of sight to a place. With 4, bonsai lost 0.04 dB more.
 SHARPNESS = 8
 # Nepers that one unit of variance of the logarithm of sizes in pixels takes from it.
@@ -216,17 +214,21 @@ def likely_cameras(splats: SplatTensors, count: int, width: int = 560, height: i
     weights = torch.softmax(logsigmoid(raw.opacities.double()) - raw.scales.double().mean(1), 0).numpy()
     middle = weights @ means
     reach = math.sqrt(weights @ ((means - middle) ** 2).sum(1)) or 1.0
-    even: Tensor = torch.quasirandom.SobolEngine(7, scramble=True, seed=0).draw(5 * count)  # type: ignore[no-untyped-call]
-    normal = torch.special.ndtri(even.double().clamp(1e-3, 1 - 1e-3)).numpy()
-    directions = normal[:, :3] / np.linalg.norm(normal[:, :3], axis=1, keepdims=True)
+    even = torch.quasirandom.SobolEngine(7, scramble=True, seed=0).draw(5 * count)  # type: ignore[no-untyped-call]
+    normal = torch.special.ndtri(even.double().clamp(1e-3, 1 - 1e-3))
+    directions = normalize(normal[:, :3]).numpy()
     away = AROUND[0] + (AROUND[1] - AROUND[0]) * even[:, 6:].numpy()
     some = RawSplats(*(spread(tensor, SOME_DETAIL).contiguous() for tensor in raw))
-    in_middle, *around = _following(some, middle + reach * np.vstack([np.zeros(3), AROUND[1] * directions]))
-    eyes = middle + reach * (INSIDE * away / AROUND[1] if in_middle > max(around) else away) * directions
-    targets = middle + reach * 0.4 * normal[:, 3:6]
+    following = _following(some)
+    # On four scenes of objects, the middle has 0.3 to 0.7 times as much as the best of the farthest places, in a room
+    # 1.75 times.
+    if following(middle[None]) > following(middle + reach * AROUND[1] * directions).max():
+        away *= INSIDE / AROUND[1]
+    eyes = middle + reach * away * directions
+    targets = middle + reach * 0.4 * normal[:, 3:6].numpy()
     low = round(96 * height / width)
     details = np.array([_detail(some, look_at(*at, 96, low, ANGLE)) for at in zip(targets, eyes, strict=True)])
-    scores = details * _following(some, eyes) ** SHARPNESS * np.exp(-EVENNESS * _size_variances(some, eyes))
+    scores = details * following(eyes) ** SHARPNESS * np.exp(-EVENNESS * _size_variances(some, eyes))
     return [look_at(targets[k], eyes[k], width, height, ANGLE) for k in np.argsort(-scores, kind="stable")[:count]]
 
 
@@ -235,28 +237,33 @@ def square_views(splats: SplatTensors, most: int) -> list[Camera]:
     return likely_cameras(splats, most, 640, 640)
 
 
-def _following(splats: RawSplats, places: Float64s) -> Float64s:
-    """How much colours follow the lines of sight to each of some places ``[P]``, most where photos were taken.
+def _following(splats: RawSplats) -> Callable[[Float64s], Float64s]:
+    """How much colours follow the lines of sight to each of places ``[P, 3]``: ``[P]``, most where photos were taken.
 
     Spherical harmonics c start at 0, and are fitted along the lines of sight of training alone. So in a cell of space,
     their mean C of c cᵀ over splats, each of length 1 and weighted by opacity, is large along Y(d) for those directions
     d: 1 / Y(d)ᵀ C⁻¹ Y(d) (Capon 1969), in the mean over :data:`CELLS`. It is 1 without harmonics.
     """
     if not splats.shN.any():
-        return np.ones(len(places))
-    cells = np.array_split(spatial_order(splats.means.numpy()), CELLS)
-    found = np.zeros(len(places))
-    for cell in cells:
+        return lambda places: np.ones(len(places))
+    degree, cells = sh_degree_of(splats.shN), []
+    for cell in np.array_split(spatial_order(splats.means.numpy()), CELLS):
         weights, shN = torch.softmax(logsigmoid(splats.opacities[cell].double()), 0), splats.shN[cell].double()
         shN = shN / shN.square().sum((1, 2), keepdim=True).sqrt().clamp_min(1e-12)
         mean = torch.einsum("n,nic,njc->ij", weights, shN, shN)
         # Not singular, and the less sharp the more noise there is.
         mean += (0.02 * mean.diagonal().mean() + 1e-9) * torch.eye(len(mean))
-        lines = normalize(weights @ splats.means[cell].double() - torch.from_numpy(places))
-        basis = sh_basis(lines, sh_degree_of(splats.shN))[:, 1:].T
-        # Infinite is only that of a place in the middle of the cell.
-        found += (basis * torch.linalg.solve(mean, basis)).sum(0).reciprocal().nan_to_num(posinf=0).numpy()
-    return found / len(cells)
+        cells.append((weights @ splats.means[cell].double(), mean))
+
+    def at(places: Float64s) -> Float64s:
+        found = np.zeros(len(places))
+        for middle, mean in cells:
+            basis = sh_basis(normalize(middle - torch.from_numpy(places)), degree)[:, 1:].T
+            # Infinite is only that of a place in the middle of the cell.
+            found += (basis * torch.linalg.solve(mean, basis)).sum(0).reciprocal().nan_to_num(posinf=0).numpy()
+        return found / CELLS
+
+    return at
 
 
 def _size_variances(splats: RawSplats, places: Float64s) -> Float64s:
