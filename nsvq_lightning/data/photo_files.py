@@ -143,8 +143,9 @@ def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]
     if len(found) != 1:
         others = " and ".join(str(path.relative_to(root)) for path in found)
         raise (SceneError if found else NoPhotosError)(
-            f"image folder {root / name} does not exist: copy the photos there, or set images_folder (or factor, for "
-            f"{name}_2, _4 and _8); they are in {others or 'no other folder up to two levels down'}"
+            f"image folder {root / name} does not exist: copy the photos there, set images_folder (or factor, for "
+            f"{name}_2, _4 and _8), or name COLMAP's folder of undistorted ones, such as {root / 'dense/0'}, as the "
+            f"scene; they are in {others or 'no other folder up to two levels down'}"
         )
     log.info("%s does not exist: photos are read from %s", root / name, found[0])
     return found[0], factor or 1

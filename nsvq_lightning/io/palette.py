@@ -165,21 +165,15 @@ def scalar_kmeans(values: Float32s, weight: Integers | int = 1, count: int = 256
     mass = mass[mass > 0]
     if len(numbers) <= count:
         return np.pad(numbers, (0, count - len(numbers)), "edge").astype(np.float32)
-    _, cells = find_palette(numbers.astype(np.float32)[:, None], mass, count)
-    starts = np.flatnonzero(np.diff(cells, prepend=-1))
+    levels = np.sort(find_palette(numbers.astype(np.float32)[:, None], mass, count)[0][:, 0]).astype(np.float64)
     middle = float(np.average(numbers, weights=mass))  # sums of differences from it lose no digits
+    sums = np.r_[0.0, (mass * (numbers - middle)).cumsum()]
     mass = np.r_[0.0, mass.cumsum()]
-    sums = np.r_[0.0, (np.diff(mass) * (numbers - middle)).cumsum()]
-
-    def means(ends: Integers, empty: Float64s) -> Float64s:
-        """Means ``[C]`` of the cells between ``ends [C + 1]``; for a cell without values, that of ``empty [C]``."""
-        inside = np.diff(mass[ends])
-        return np.where(inside > 0, np.diff(sums[ends]) / np.where(inside > 0, inside, 1) + middle, empty)
-
-    levels = means(np.array([*starts, len(numbers)]), np.zeros(count))
     for _ in range(500):  # each costs one search of 256 borders, whatever the number of values
-        borders = np.searchsorted(numbers, _borders(levels))
-        moved = means(np.array([0, *borders, len(numbers)]), levels)
+        ends = [0, *np.searchsorted(numbers, _borders(levels)), len(numbers)]
+        inside = np.diff(mass[ends])
+        means = np.diff(sums[ends]) / np.where(inside > 0, inside, 1) + middle
+        moved = np.where(inside > 0, means, levels)
         if np.array_equal(moved, levels):
             break
         levels = moved

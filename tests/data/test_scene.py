@@ -266,7 +266,7 @@ def test_missing_image_folder(make_scene: SceneFactory) -> None:
     assert len(load_scene(root)) == 9
     assert len(load_scene(root, factor=2)) == 9
     shutil.copytree(root / "images_2", root / "images_4")
-    with pytest.raises(SceneError, match=r"\(or factor, for images_2, _4 and _8\); they are in images_2 and images_4$"):
+    with pytest.raises(SceneError, match=r"such as .*dense/0, as the scene; they are in images_2 and images_4$"):
         load_scene(root)
     assert len(load_scene(root, images_folder="images_2")) == 9
     shutil.rmtree(root / "images_2")
