@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import add_root, cameras_of, positive, scene_file, trained_scene
+from nsvq_lightning.commands.arguments import add_root, positive, scene_file, scene_with_views
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
@@ -79,6 +79,7 @@ def run(options: argparse.Namespace) -> int:
     import torch
 
     from nsvq_lightning.compute.devices import best_device
+    from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.report.pictures import VIDEO, frame_writer
 
@@ -87,9 +88,9 @@ def run(options: argparse.Namespace) -> int:
     is_video = output.suffix.lower() == VIDEO
     if output.suffix and not is_video:
         raise ValueError(f"{output}: name a video ({VIDEO}), or a folder for PNGs")
-    scene = trained_scene(file, options.root)
+    scene, known, _ = scene_with_views(read_scene(file), file, options.root)
     splats = scene.decode()
-    cameras, fps = _path(options, splats, is_video)
+    cameras, fps = _path(options, splats, known, is_video)
     device = best_device()
     raw = splats.to(device).raw()
     look = partial(
@@ -108,12 +109,13 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _path(options: argparse.Namespace, splats: "Splats", is_video: bool) -> "tuple[list[Camera], float]":
-    """The cameras and frames per second that the options ask for."""
+def _path(
+    options: argparse.Namespace, splats: "Splats", cameras: "list[Camera]", is_video: bool
+) -> "tuple[list[Camera], float]":
+    """The cameras and frames per second that the options ask for, given those of the photos, if any are known."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.rendering.camera_paths import orbit, read_camera_path, reframed, smooth_path
 
-    cameras = list(cameras_of(options.scene, options.root, splats.means.detach().numpy()).values())
     kind = options.path or ("through" if cameras else "orbit")
     fps = options.fps or FPS
     if kind not in ("through", "cameras", "orbit"):

@@ -59,7 +59,7 @@ def test_a_run_knows_its_photos(scene: Path, demo_scene: Path, tmp_path: Path) -
 
 
 def test_a_run_knows_its_cameras_without_its_photos(
-    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     save(random_splats(50), tmp_path / "scene.nsvq")
     cameras = load_scene(demo_scene).cameras
@@ -74,8 +74,10 @@ def test_a_run_knows_its_cameras_without_its_photos(
     assert torch.allclose(found["b"].viewmat, cameras[1].viewmat, atol=1e-6)
     assert "guessed" not in capsys.readouterr().err
     (tmp_path / "viewer.html").write_text('<script id="scene" type="application/json">{"cameras": [{}]}</script>')
-    assert _run(tmp_path) == 1
-    assert "viewer.html are damaged ('name'): name the photos with --data.root" in capsys.readouterr().err
+    assert _run(tmp_path, "--path", "cameras") == 1
+    assert "--path cameras needs cameras of photos: name their folder (--data.root)" in capsys.readouterr().err
+    (warning,) = (record.message for record in caplog.records if record.levelname == "WARNING")
+    assert "viewer.html are damaged ('name'): name the photos with --data.root" in warning
 
 
 def test_without_photos_cameras_are_guessed(tmp_path: Path) -> None:
