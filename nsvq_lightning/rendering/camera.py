@@ -9,6 +9,9 @@ from torch import Tensor
 
 from nsvq_lightning.rendering.constants import FRUSTUM_MARGIN, NEAR
 
+# Shortest focal length in sides of the picture, of a view of 178 degrees: a shorter one is not in pixels.
+MIN_FOCAL = 0.01
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -25,8 +28,8 @@ class Camera:
             machine.
 
     Raises:
-        ValueError: A matrix has another shape or kind, the image is empty, or the focal lengths or ``near`` are not
-            positive and finite.
+        ValueError: A matrix has another shape or kind, the image is empty, the focal lengths are not finite or below
+            :data:`MIN_FOCAL`, or ``near`` is not positive and finite.
     """
 
     K: Tensor
@@ -48,8 +51,9 @@ class Camera:
         # Kept as Python floats: reading them from an accelerator would stall it at every render.
         intrinsics = fx, fy, cx, cy
         vars(self).update(intrinsics=intrinsics, packed_view=_packed(self.viewmat))
-        if not (all(map(math.isfinite, intrinsics)) and min(fx, fy) > 0):
-            raise ValueError(f"Camera.K needs positive, finite focal lengths and a finite centre, got {intrinsics}")
+        sides = fx / self.width, fy / self.height
+        if not (all(map(math.isfinite, intrinsics)) and min(sides) > MIN_FOCAL):
+            raise ValueError(f"Camera.K needs positive, finite focal lengths and a centre, in pixels, got {intrinsics}")
         if not 0 < self.near < math.inf:
             raise ValueError(f"Camera.near must be positive and finite, got {self.near}")
         if [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] != K:

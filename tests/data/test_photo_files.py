@@ -90,7 +90,7 @@ def test_the_only_folder_that_has_the_photos_is_used(tmp_path: Path, place: str)
     write(tmp_path / "masks", *names)
     assert photo_folder(tmp_path, "images", 2, names) == (tmp_path / place, 2)
     write(tmp_path / "other", *names)
-    with pytest.raises(SceneError, match=r"or set images_folder .*; they are in (.* and other|other and .*)"):
+    with pytest.raises(SceneError, match=r"set images_folder .*; they are in (.* and other|other and .*)"):
         photo_folder(tmp_path, "images", None, names)
 
 

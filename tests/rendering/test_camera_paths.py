@@ -239,6 +239,7 @@ def test_cameras_of_inrias_trainer_have_the_size_it_trained(
         ({"width": 10**9}, "a picture of 1000000000x"),
         ({"height": 0}, "at least one pixel"),
         ({"fx": 0}, "positive, finite focal lengths"),
+        ({"fx": 0.1}, "finite focal lengths and a centre, in pixels, got .0.1"),
         ({"fx": None}, "float"),
     ],
 )
