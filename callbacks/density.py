@@ -295,7 +295,7 @@ def reset_opacities(module: SplatModule, ceiling: float) -> None:
     """Lower all opacities to at most ``ceiling``, and forget their moments."""
     optimizer = module.trainer.optimizers[0]
     lowered = module.splats.opacities.clamp(max=math.log(ceiling / (1.0 - ceiling)))
-    row_ops.replace_attribute(module.splats, optimizer, "opacities", lowered)
+    row_ops.replace_attribute(module.splats, "opacities", lowered)
     row_ops.reset_moments(optimizer, "opacities")
     distributed.check_replicas(module.trainer, "the opacity reset")
 

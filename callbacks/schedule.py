@@ -218,13 +218,10 @@ class LearningRateDecay(SplatCallback):
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Scale the rates of this iteration."""
-        if self.final == 1.0:
-            return
         schedule = module.schedule
         start = schedule.ends[Phase.QUANTIZE] if self.start is None else schedule.iteration(self.start)
         end = schedule.ends[Phase.FINETUNE]
         progress = min(max((trainer.global_step + 1 - start) / max(end - start, 1), 0.0), 1.0)
-        if progress > 0.0:
-            for group in trainer.optimizers[0].param_groups:
-                if group["name"] != "means":
-                    module.scale_rate(group["name"], self.final**progress)
+        for group in trainer.optimizers[0].param_groups:
+            if group["name"] != "means":
+                module.scale_rate(group["name"], self.final**progress)

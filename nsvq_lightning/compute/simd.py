@@ -193,12 +193,6 @@ def broadcast(builder, scalar):
 
 
 @_function(Lanes, types.Array, types.int64)
-def load_one(builder, array, offset):
-    """``load_one(array, offset)``: one float in every lane."""
-    return _broadcast(builder, _VF, builder.load(builder.gep(array, [offset])))
-
-
-@_function(Lanes, types.Array, types.int64)
 def load(builder, array, offset):
     """``load(array, offset)``: 16 consecutive floats."""
     return _read(builder, builder.gep(array, [offset]))

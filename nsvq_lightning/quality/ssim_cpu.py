@@ -14,7 +14,7 @@ from torch import Tensor
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat, flat_checked, recycled
-from nsvq_lightning.compute.rows import share
+from nsvq_lightning.compute.rows import clear, share
 from nsvq_lightning.quality import formulas
 from nsvq_lightning.quality.formulas import SSIM_RADIUS, check_pair, ssim_window
 
@@ -35,18 +35,11 @@ def row_of(y, planes, pitch):
 
 
 @inline
-def clear_row(ring, o, count):
-    """Zero ``count`` floats."""
-    for x in range(0, count, 16):
-        simd.store(ring, o + x, 0)
-
-
-@inline
 def take_row(image, target, white, images, y, height, length, pitch):
     """Load row y of both images into their ring buffer: the image clamped, the target divided by ``white``."""
     o = row_of(y, IMAGES, pitch)
     if y < 0 or y >= height:
-        clear_row(images, o, IMAGES * pitch)
+        clear(images, o, o + IMAGES * pitch)
     else:
         for x_ in range(0, length, 16):
             # The last vector of a row overlaps the one before it instead of running past the end.
@@ -99,9 +92,8 @@ def similarity_of_row(moments, derivatives, length, pitch, lanes):
         m1, m2 = blur_along(moments, o), blur_along(moments, pitch + o)
         squares, product = blur_along(moments, 2 * pitch + o), blur_along(moments, 3 * pitch + o)
         similarity, slopes = formulas.similarity(m1, m2, squares, product)
-        simd.store(derivatives, o, slopes[0])
-        simd.store(derivatives, pitch + o, slopes[1])
-        simd.store(derivatives, 2 * pitch + o, slopes[2])
+        for plane in range(DERIVATIVES):
+            simd.store(derivatives, plane * pitch + o, slopes[plane])
         total = total + simd.where(lane >= F(x_ - x), similarity, 0)
     return simd.lane_sum(total)
 
@@ -175,7 +167,7 @@ def sweep_image(
         take_row(image, target, white, own_images, y + SSIM_RADIUS, height, length, pitch)
         slot = row_of(y, DERIVATIVES, pitch)
         if y < 0 or y >= height:
-            clear_row(own_ring, slot, DERIVATIVES * pitch)
+            clear(own_ring, slot, slot + DERIVATIVES * pitch)
         else:
             moments_of_row(own_images, y, length, pitch, own_moments)
             similarity = similarity_of_row(own_moments, own_derivatives, length, pitch, lanes)

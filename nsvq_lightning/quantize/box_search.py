@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline, kernel, parallel, thread_count
+from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, INT32, INT64, Array, aligned_empty, check_array, check_table, outside
 from nsvq_lightning.compute.rows import count_outside
 
@@ -32,61 +32,6 @@ _TASKS = 2048  # capacity for visits to leaves, which are deferred and processed
 MAX_DIM = 8
 
 
-@inline
-def _widest_axis(points, order, start, stop):
-    axis, widest = 0, F(-1)
-    for j in range(points.shape[0]):
-        low = high = points[j, order[start]]
-        for i in range(start + 1, stop):
-            value = points[j, order[i]]
-            low, high = min(low, value), max(high, value)
-        if high - low > widest:
-            axis, widest = j, high - low
-    return axis
-
-
-@inline
-def _split(values, order, start, stop, middle):
-    """Quickselect: the ``middle - start`` smallest of ``order[start:stop]`` come first."""
-    stop -= 1
-    while start < stop:
-        pivot = values[order[(start + stop) // 2]]
-        low, high = start, stop
-        while low <= high:
-            while values[order[low]] < pivot:
-                low += 1
-            while values[order[high]] > pivot:
-                high -= 1
-            if low <= high:
-                order[low], order[high] = order[high], order[low]
-                low, high = low + 1, high - 1
-        if middle <= high:
-            stop = high
-        elif middle >= low:
-            start = low
-        else:
-            return
-
-
-@kernel
-def _sort_into_leaves(points, order):
-    """Split by medians at multiples of 256 codes (a node), then of 16 (a leaf)."""
-    stack = np.empty((64, 2), np.int64)
-    stack[0, 0], stack[0, 1] = 0, order.shape[0]
-    depth = 1
-    while depth > 0:
-        depth -= 1
-        start, stop = stack[depth, 0], stack[depth, 1]
-        size = 256 if stop - start > 256 else 16
-        if stop - start <= size:
-            continue
-        middle = start + (stop - start + size - 1) // size // 2 * size
-        _split(points[_widest_axis(points, order, start, stop)], order, start, stop, middle)
-        stack[depth, 0], stack[depth, 1] = start, middle
-        stack[depth + 1, 0], stack[depth + 1, 1] = middle, stop
-        depth += 2
-
-
 def sort_into_leaves(codebook: Array) -> Array:
     """Codes ``[K]`` int32 in an order in which each 16, a leaf, are near each other, and each 256, a node.
 
@@ -96,7 +41,17 @@ def sort_into_leaves(codebook: Array) -> Array:
     """
     check_table("codebook", codebook)
     order = np.arange(len(codebook), dtype=np.int32)
-    _sort_into_leaves(_points(codebook), order)
+    columns = np.nan_to_num(codebook.T, nan=3e38).astype(np.float64)
+    parts = [order]
+    while parts:
+        part = parts.pop()
+        size = 256 if len(part) > 256 else 16
+        if len(part) > size:
+            middle = -(-len(part) // size) // 2 * size
+            values = columns[:, part]
+            widest = values[np.ptp(values, axis=1).argmax()]
+            part[:] = part[widest.argpartition(middle)]
+            parts += part[:middle], part[middle:]
     return order
 
 

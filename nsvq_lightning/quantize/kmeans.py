@@ -13,14 +13,14 @@ from torch.autograd.function import once_differentiable
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import parallel, thread_count
 from nsvq_lightning.compute.memory import INT64, flat_checked
-from nsvq_lightning.compute.rows import put_rows
+from nsvq_lightning.compute.rows import put_rows, share
 from nsvq_lightning.quantize.nearest import nearest
 
 
 @parallel
 def _sum_rows(part, parts, values, codes, sums):
     """Each part owns a range of codes and scans all rows, so the order of the threads cannot change a sum."""
-    first, last = part * sums.shape[0] // parts, (part + 1) * sums.shape[0] // parts
+    first, last = share(sums.shape[0], part, parts)
     for i in range(codes.shape[0]):
         code = codes[i]
         if first <= code < last:
@@ -129,10 +129,9 @@ def kmeans(
         if not used.all():
             x, weight = x[used], weight[used]
     if start is None:
-        first = distinct_rows(x)
-        distinct = x[first] if len(first) < len(x) else x
+        distinct = x[distinct_rows(x)]
         if len(distinct) <= k:
-            return distinct.clone()
+            return distinct
         start = rows_far_apart(distinct, k, generator) if spread else distinct[shuffled(distinct, generator)[:k]]
     centroids = start.clone()
     for _ in range(steps):

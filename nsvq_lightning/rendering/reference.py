@@ -181,7 +181,7 @@ def render(
                 pixels, centres[near], projection.conics[near], projection.opacities[near], features[near],
                 weights_here, watched[near],
             )  # fmt: skip
-            blended = checkpoint(_blend, *inputs, use_reentrant=False) if torch.is_grad_enabled() else _blend(*inputs)
+            blended = checkpoint(_blend, *inputs, use_reentrant=False)
             tiles.append(blended.view(bottom - top, right - left, 5))
         strips.append(torch.cat(tiles, 1))
     blended = torch.cat(strips, 0)

@@ -72,7 +72,7 @@ def keep_rows(splats: Splats, optimizer: Optimizer, mask: Tensor) -> None:
     _edit_tables(splats, select)
 
 
-def replace_attribute(splats: Splats, optimizer: Optimizer, name: str, values: Tensor) -> None:
+def replace_attribute(splats: Splats, name: str, values: Tensor) -> None:
     """Overwrite all rows of one attribute; the moments stay, see :func:`reset_moments`.
 
     Raises:
@@ -81,7 +81,7 @@ def replace_attribute(splats: Splats, optimizer: Optimizer, name: str, values: T
     parameter = splats.attributes()[name]
     if values.shape != parameter.shape:
         raise ValueError(f"{name} must keep its shape {list(parameter.shape)}, got {list(values.shape)}")
-    _rebind(splats, optimizer, name, values.detach().to(parameter), lambda moment: moment)
+    parameter.detach().copy_(values)
 
 
 def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: Tensor, maps: Tensor) -> None:
@@ -102,7 +102,7 @@ def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: 
     """
     if maps.shape != (*values.shape, values.shape[-1]):
         raise ValueError(f"maps of {name} must be {[*values.shape, values.shape[-1]]}, got {list(maps.shape)}")
-    replace_attribute(splats, optimizer, name, values)
+    replace_attribute(splats, name, values)
     for key, moment in _moments(optimizer, name).items():
         factors = maps if key == FIRST_MOMENT else maps.square()
         moment.copy_((factors * moment[:, None, :]).sum(2))

@@ -52,7 +52,7 @@ def test_a_scalar_stands_for_a_vector_of_it(values: Array) -> None:
         simd.store(out, 32, simd.where(x > third, simd.fma(third, x, 1), 0))
         simd.store(out, 48, simd.maximum(2, simd.minimum(x, 3)))
         simd.store(out, 64, third)
-        simd.store(out, 80, simd.load_one(a, 5))
+        simd.store(out, 80, simd.get(a, 5))
         simd.store(out, 96, simd.load_vectors(a, 16)[2])
 
     x, one = values[:16], np.float32(1)

@@ -9,10 +9,11 @@ from collections.abc import Iterator
 import pytest
 import torch
 
+from nsvq_lightning.compute.rows import sorted_by_key
 from nsvq_lightning.quantize.cuda import search as search_module
 from nsvq_lightning.quantize.cuda import substitution as substitution_module
 from nsvq_lightning.quantize.cuda.search import DeviceTracker, nearest_codes
-from nsvq_lightning.quantize.cuda.substitution import sorted_by_code, substitute, sum_rows
+from nsvq_lightning.quantize.cuda.substitution import substitute, sum_rows
 from nsvq_lightning.quantize.kmeans import kmeans
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.nsvq import NSVQ, noise_substitution
@@ -150,9 +151,9 @@ def test_frozen_codes_are_sorted_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def counting(codes: torch.Tensor, num_codes: int) -> tuple[torch.Tensor, torch.Tensor]:
         sorted_codes.append(num_codes)
-        return sorted_by_code(codes, num_codes)
+        return sorted_by_key(codes, num_codes)
 
-    monkeypatch.setattr(substitution_module, "sorted_by_code", counting)
+    monkeypatch.setattr(substitution_module, "sorted_by_key", counting)
     values, codes = torch.randn(30, 3, device=DEVICE), torch.arange(30, device=DEVICE) % 4
     first = sum_rows(values, codes, 4, torch.float32)
     assert torch.equal(sum_rows(values, codes, 4, torch.float32), first)
@@ -166,7 +167,7 @@ def test_frozen_codes_are_sorted_once(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("num_codes", [32_767, 32_768, 40_001])
 def test_codes_beyond_sixteen_bits(num_codes: int) -> None:
     last = num_codes - 1
-    order, offsets = sorted_by_code(torch.tensor([last, 0, last, 32_766], device=DEVICE), num_codes)
+    order, offsets = sorted_by_key(torch.tensor([last, 0, last, 32_766], device=DEVICE), num_codes)
     starts = offsets.tolist()
     assert [order[starts[code] : starts[code + 1]].tolist() for code in (0, last)] == [
         [1],

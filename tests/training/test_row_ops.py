@@ -117,7 +117,7 @@ def test_replaced_values_keep_their_moments() -> None:
     splats = make(3)
     optimizer = trained(splats, 1)
     moment = state_of(splats, optimizer, "opacities")["exp_avg"].clone()
-    replace_attribute(splats, optimizer, "opacities", torch.zeros(3))
+    replace_attribute(splats, "opacities", torch.zeros(3))
     assert not splats.opacities.any()
     assert torch.equal(state_of(splats, optimizer, "opacities")["exp_avg"], moment)
 
@@ -140,7 +140,7 @@ def test_moments_follow_into_other_coordinates() -> None:
 
     always = make(4)
     other = build_adam(param_groups(always, {}, LearningRates(scales=0.0), extent=1.0))
-    replace_attribute(always, other, "scales", start.scales @ swap.T / 4)
+    replace_attribute(always, "scales", start.scales @ swap.T / 4)
     for weight in (1.0, -2.0, 0.5):
         step(always, other, weight, 4 * swap.T)
 
@@ -179,6 +179,6 @@ def test_wrong_edits_are_refused() -> None:
     with pytest.raises(ValueError, match=r"quats must have shape \[1, 4\]"):
         append_rows(splats, optimizer, uneven)
     with pytest.raises(ValueError, match="must keep its shape"):
-        replace_attribute(splats, optimizer, "opacities", torch.zeros(4))
+        replace_attribute(splats, "opacities", torch.zeros(4))
     with pytest.raises(ValueError, match="no parameter group 'albedo'"):
         reset_moments(optimizer, "albedo")

@@ -16,6 +16,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
+from nsvq_lightning.compute.rows import sorted_by_key
 from nsvq_lightning.quantize import substitution
 
 SPLIT = tl.constexpr(0x3F3504F3)  # bits of 1/√2: a mantissa lies in [1/√2, √2)
@@ -232,25 +233,16 @@ def sum_kernel(partial, offsets, sums, dim, WIDTH: tl.constexpr):
     tl.store(sums + code * dim + column, tl.sum(total, 0), mask=column < dim)
 
 
-def sorted_by_code(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
-    """Rows ``[N]`` int64, stably sorted by code, and where each code begins ``[K + 1]`` int32."""
-    # 16-bit keys take a quarter of the sorting passes of 64-bit ones.
-    key = torch.int16 if num_codes < 2**15 else torch.int32
-    keys, order = codes.to(key).sort(stable=True)
-    starts = torch.searchsorted(keys, torch.arange(num_codes + 1, dtype=key, device=codes.device), out_int32=True)
-    return order, starts
-
-
 # Rows by code of codes that still exist, with the version of these codes and how many there may be.
 _sorted = WeakTensorKeyDictionary()
 
 
 def _remembered(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
-    """:func:`sorted_by_code`, once for codes that stay the same, as frozen ones do."""
+    """:func:`sorted_by_key`, once for codes that stay the same, as frozen ones do."""
     state = codes._version, num_codes
     known, found = _sorted.get(codes, (None, None))
     if known != state:
-        found = sorted_by_code(codes, num_codes)
+        found = sorted_by_key(codes, num_codes)
         _sorted[codes] = state, found
     order, starts = found
     return order, starts

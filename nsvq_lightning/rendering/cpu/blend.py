@@ -102,9 +102,9 @@ def reachable_blocks(batch, o, x, y, grid):
     left = simd.load(grid, 512) - x
     top = simd.load(grid, 528) - y
     side = F(BLOCK_SIDE - 1)
-    a, b, c = rec.load3(batch, o + rec.A)
-    slope_x = simd.load_one(batch, o + rec.SLOPE_X)
-    slope_y = simd.load_one(batch, o + rec.SLOPE_Y)
+    a, b, c = rec.get3(batch, o + rec.A)
+    slope_x = simd.get(batch, o + rec.SLOPE_X)
+    slope_y = simd.get(batch, o + rec.SLOPE_Y)
     peak = highest_exponent(a, b, c, slope_x, slope_y, left, left + side, top, top + side)
     return simd.mask_bits(peak >= LOG2_ALPHA_MIN - REACH_MARGIN - simd.get(batch, o + rec.LOG2_OPACITY))
 
@@ -112,10 +112,10 @@ def reachable_blocks(batch, o, x, y, grid):
 @inline
 def alpha_at(batch, r, x, y):
     """α of one splat of a batch on a block of pixels, 0 below 1/255; a batch holds (u0, v0) in place of the centre."""
-    a, b, c = rec.load3(batch, r + rec.A)
-    u0 = simd.load_one(batch, r + rec.X)
-    v0 = simd.load_one(batch, r + rec.Y)
-    power, _, _ = exponent(a, b, c, u0, v0, simd.load_one(batch, r + rec.LOG2_OPACITY), x, y)
+    a, b, c = rec.get3(batch, r + rec.A)
+    u0 = simd.get(batch, r + rec.X)
+    v0 = simd.get(batch, r + rec.Y)
+    power, _, _ = exponent(a, b, c, u0, v0, simd.get(batch, r + rec.LOG2_OPACITY), x, y)
     _, alpha = alpha_of(power)
     return alpha
 
@@ -143,8 +143,8 @@ def blend_one(batch, r, alpha, t, after, kept):
     left, color, depth = kept
     open_ = after >= TRANSMITTANCE_MIN
     weight = simd.where(open_, alpha * t, 0)
-    color = fma3(weight, rec.load3(batch, r + rec.RED), color)
-    depth = simd.fma(weight, simd.load_one(batch, r + rec.DEPTH), depth)
+    color = fma3(weight, rec.get3(batch, r + rec.RED), color)
+    depth = simd.fma(weight, simd.get(batch, r + rec.DEPTH), depth)
     return simd.where(open_, after, left), color, depth
 
 
@@ -207,17 +207,16 @@ def blend_block(block, count, batch, grid, state, touched, first):
 def write_block(block, corner, size, background, state, planes):
     """Add the background and write one block, pixel by pixel where it extends beyond the image."""
     width, height = size
-    image, transmittance, depth, alpha = planes
+    image, transmittance, depth = planes
     o = 16 * block
     x0, y0 = block_corner(block, corner)
     t = simd.load(state, T_LEFT + o)
-    color = fma3(t, rec.load3(background, 0), load_color(state, o))
+    color = fma3(t, rec.get3(background, 0), load_color(state, o))
     if x0 + BLOCK_SIDE <= width and y0 + BLOCK_SIDE <= height:
         pixel = y0 * width + x0
         simd.store_block3(image, 3 * pixel, 3 * width, color)
         simd.store_block1(transmittance, pixel, width, (t,))
         simd.store_block1(depth, pixel, width, (simd.load(state, Z_SUM + o),))
-        simd.store_block1(alpha, pixel, width, (1 - t,))
         return
     store_color(state, o, color)
     for lane in range(16):
@@ -227,7 +226,6 @@ def write_block(block, corner, size, background, state, planes):
             s = o + lane
             simd.put(transmittance, pixel, simd.get(state, T_LEFT + s))
             simd.put(depth, pixel, simd.get(state, Z_SUM + s))
-            simd.put(alpha, pixel, 1 - simd.get(state, T_LEFT + s))
             for channel in range(3):
                 simd.put(image, 3 * pixel + channel, simd.get(state, R_SUM + 256 * channel + s))
 
@@ -383,9 +381,9 @@ def splat_backward(records, row, blocks, corner, wanted, state):
     zero = simd.broadcast(0)
     r = rec.RECORD * row
     _, _, (a, b, c, u0, v0) = in_tile(records, r, corner)
-    peak = simd.load_one(records, r + rec.LOG2_OPACITY)
-    z = simd.load_one(records, r + rec.DEPTH)
-    color = rec.load3(records, r + rec.RED)
+    peak = simd.get(records, r + rec.LOG2_OPACITY)
+    z = simd.get(records, r + rec.DEPTH)
+    color = rec.get3(records, r + rec.RED)
     s_color = s_squares = zero, zero, zero
     s_h, s_u, s_v, s_z = zero, zero, zero, zero
     s_ax, s_ay, s_map = zero, zero, zero

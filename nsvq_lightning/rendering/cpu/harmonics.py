@@ -61,11 +61,13 @@ def gather_sh(shN, ids, start, stride, count, columns):
 
 
 @inline
-def add_band(columns, k, basis, rgb):
-    """Add coefficient k (counted without the constant one) times its basis value to a colour."""
-    o = 48 * k
-    coefficient = simd.load(columns, o), simd.load(columns, o + 16), simd.load(columns, o + 32)
-    return fma3(basis, coefficient, rgb)
+def add_bands(columns, first, basis, rgb):
+    """Add coefficients from the ``first`` on, counted without the constant one, times basis values to a colour."""
+    for i in range(len(basis)):
+        o = 48 * (first + i)
+        coefficient = simd.load(columns, o), simd.load(columns, o + 16), simd.load(columns, o + 32)
+        rgb = fma3(basis[i], coefficient, rgb)
+    return rgb
 
 
 @inline
@@ -73,17 +75,11 @@ def color(degree, d, sh0, columns):
     """0.5 + Σ coefficient·basis for 16 splats, before the clamp at 0."""
     rgb = simd.fma(sh0[0], C0, 0.5), simd.fma(sh0[1], C0, 0.5), simd.fma(sh0[2], C0, 0.5)
     if degree > 0:
-        b1 = bands1(d)
-        for i in range(3):
-            rgb = add_band(columns, i, b1[i], rgb)
+        rgb = add_bands(columns, 0, bands1(d), rgb)
     if degree > 1:
-        b2 = bands2(d)
-        for i in range(5):
-            rgb = add_band(columns, 3 + i, b2[i], rgb)
+        rgb = add_bands(columns, 3, bands2(d), rgb)
     if degree > 2:
-        b3 = bands3(d)
-        for i in range(7):
-            rgb = add_band(columns, 8 + i, b3[i], rgb)
+        rgb = add_bands(columns, 8, bands3(d), rgb)
     return rgb
 
 
@@ -96,7 +92,7 @@ def color_range(camera, means, colors, bands, ids, first, last, records):
     for start in range(first, last, 16):
         prefetch_sh(shN, ids, start + AHEAD, last, stride, coefficients)
         mean = simd.gather_rows3(means, ids, start)
-        direction, _ = unit_direction(rec.load3(camera, rec.POSITION), mean)
+        direction, _ = unit_direction(rec.get3(camera, rec.POSITION), mean)
         if degree > 0:
             gather_sh(shN, ids, start, stride, coefficients, scratch)
         rgb = clamped(color(degree, direction, simd.gather_rows3(sh0, ids, start), scratch))
@@ -151,7 +147,7 @@ def scatter_sh(gradient, columns, ids, start, stride, count):
 def color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN):
     """Gradients of the SH coefficients; returns that of the mean through the viewing direction."""
     stride, degree = bands
-    d, inverse = unit_direction(rec.load3(camera, rec.POSITION), mean)
+    d, inverse = unit_direction(rec.get3(camera, rec.POSITION), mean)
     coefficients = coefficients_of(degree)
     columns, gradient, e = simd.scratch(COLUMNS), simd.scratch(COLUMNS), simd.scratch(256)
     if degree > 0:

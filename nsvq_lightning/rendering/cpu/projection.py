@@ -16,8 +16,8 @@ PROJECTION_SCRATCH = 128 + 16 * rec.RECORD
 @inline
 def load_screen(camera):
     """The screen of :func:`nsvq_lightning.rendering.formulas.footprint`."""
-    width, height, near = rec.load3(camera, rec.WIDTH)
-    return simd.load_one(camera, rec.CX), simd.load_one(camera, rec.CY), width, height, near
+    width, height, near = rec.get3(camera, rec.WIDTH)
+    return simd.get(camera, rec.CX), simd.get(camera, rec.CY), width, height, near
 
 
 @inline
@@ -36,7 +36,7 @@ def project_range(camera, sampling, means, quats, scales, logits, first, last, r
         lanes = (1 << count) - 1
         view = rec.load_view(camera)
         point = view_point(view, mean)
-        if simd.mask_bits(point[2] > simd.load_one(camera, rec.NEAR)) & lanes == 0:
+        if simd.mask_bits(point[2] > simd.get(camera, rec.NEAR)) & lanes == 0:
             continue
         quat, scale = load_quats(quats, start, count), load_vectors(scales, start, count)
         logit = load_numbers(logits, start, count)
@@ -44,7 +44,7 @@ def project_range(camera, sampling, means, quats, scales, logits, first, last, r
         if sampling is not None:
             nearest = load_numbers(sampling[0], start, count)
             farthest = load_numbers(sampling[1], start, count)
-            trained_at = nearest, farthest, simd.broadcast(sampling[2])
+            trained_at = nearest, farthest, sampling[2]
         seen, record, corner, end, radius = footprint(view, load_screen(camera), point, quat, scale, logit, trained_at)
         bits = simd.mask_bits(seen) & lanes
         if bits == 0:

@@ -69,7 +69,7 @@ def project_backward(
         trained_at = None
         if sampling is not None:
             nearest, farthest = simd.gather_rows1(sampling[0], ids, start), simd.gather_rows1(sampling[1], ids, start)
-            trained_at = nearest[0], farthest[0], simd.broadcast(sampling[2])
+            trained_at = nearest[0], farthest[0], sampling[2]
         g_mean, g_quat, g_scale = formulas.geometry_backward(
             view, formulas.view_point(view, mean), quat, scale, factor, moments, total[rec.SUM_H], (g2x, g2y),
             total[rec.SUM_DEPTH], trained_at,

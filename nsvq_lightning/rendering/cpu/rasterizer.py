@@ -18,8 +18,8 @@ from nsvq_lightning.rendering.cpu import blend as blending
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.sampling import ViewSampling
 from nsvq_lightning.skips import is_on
-from nsvq_lightning.splats.attributes import ATTRIBUTES
-from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
+from nsvq_lightning.splats.splats import RawSplats, sh_degree_of
 
 # Fewer splats than these are not worth a part of their own: to wake a thread takes a tenth of a millisecond.
 PROJECTED, LISTED, SORTED = 2048, 4096, 65_536
@@ -34,12 +34,12 @@ class _Frame:
         if sampling is not None:
             nearest, farthest = sampling.distances
             self.sampling = flat(nearest), flat(farthest), np.float32(sampling.size)
-        self.size = width, height = camera.width, camera.height
+        self.size = width, height = camera.size
         self.group_columns, group_rows = rec.group_grid(width, height)
         self.tiles = self.group_columns * group_rows * rec.GROUP_TILES
         self.n = n = splats.means.shape[0]
         coefficients = splats.shN.shape[1]
-        shapes = (n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, coefficients, 3)
+        shapes = ((n, *shape) for shape in attribute_shapes(sh_degree_of(splats.shN)).values())
         attributes = tuple(map(flat_checked, ATTRIBUTES, splats, shapes))
         self.geometry, self.colors = attributes[:4], attributes[4:]
         self.bands = 3 * coefficients, degree
@@ -158,7 +158,7 @@ class _Blend(torch.autograd.Function):
     def forward(ctx: Any, frame: _Frame, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
         _means2d, _token, background, pixel_weights, _absgrad = inputs
         shape = frame.size[::-1]
-        planes = image, transmittance, depth, alpha = [recycled((*shape, *last)) for last in ((3,), (), (), ())]
+        planes = image, transmittance, depth = recycled((*shape, 3)), recycled(shape), recycled(shape)
         frame.bin()
         behind = flat_checked("background", background.contiguous(), (3,))
         blending.blend(
@@ -168,7 +168,7 @@ class _Blend(torch.autograd.Function):
         ctx.frame = frame
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(image, transmittance, depth, pixel_weights)
-        return image, alpha, depth
+        return image, 1 - transmittance, depth
 
     @staticmethod
     @once_differentiable

@@ -10,8 +10,6 @@ group sums the gradients of one splat. Slots are numbered splat by splat, so tha
 fixed order, whichever thread processed which group: results have the same bits for any number of threads.
 """
 
-from weakref import WeakKeyDictionary
-
 import numpy as np
 
 from nsvq_lightning.compute import simd
@@ -40,25 +38,19 @@ ROTATION, TRANSLATION, POSITION, FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, W
 )  # fmt: skip
 # Largest image side in pixels: a record has 16 bits, one of them the sign, for a tile's column or row.
 MAX_SIDE = TILE * (2**15 - 1)
-# Cameras as kernels read them.
-_packed: WeakKeyDictionary[Camera, Array] = WeakKeyDictionary()
 
 
 def pack_camera(camera: Camera) -> Array:
-    """A camera as kernels read it; packed once.
+    """A camera as kernels read it.
 
     Raises:
         ValueError: The image is too large.
     """
-    packed = _packed.get(camera)
-    if packed is None:
-        size = camera.width, camera.height
-        if max(size) > MAX_SIDE:
-            raise ValueError(f"an image side may have {MAX_SIDE} pixels, got {size[0]}x{size[1]}; render it in parts")
-        lens = *camera.intrinsics, *camera.slope_limits, *size, camera.near
-        packed = np.array([*camera.packed_view, *lens], np.float32)
-        _packed[camera] = packed
-    return packed
+    width, height = camera.size
+    if max(width, height) > MAX_SIDE:
+        raise ValueError(f"an image side may have {MAX_SIDE} pixels, got {width}x{height}; render it in parts")
+    lens = *camera.intrinsics, *camera.slope_limits, width, height, camera.near
+    return np.array([*camera.packed_view, *lens], np.float32)
 
 
 GROUP_SHIFT = 2
@@ -79,12 +71,6 @@ def get3(array, offset):
 
 
 @inline
-def load3(array, offset):
-    """A vector that is the same for all splats."""
-    return simd.load_one(array, offset), simd.load_one(array, offset + 1), simd.load_one(array, offset + 2)
-
-
-@inline
 def record_of(rows, i):
     """Where the record of the i-th of some rows begins."""
     return RECORD * np.int64(simd.get(rows, i))
@@ -93,8 +79,8 @@ def record_of(rows, i):
 @inline
 def load_view(camera):
     """The view of :mod:`nsvq_lightning.rendering.formulas`."""
-    rotation = load3(camera, ROTATION), load3(camera, ROTATION + 3), load3(camera, ROTATION + 6)
-    focal = simd.load_one(camera, FX), simd.load_one(camera, FY)
-    slopes_x = simd.load_one(camera, LOW_X), simd.load_one(camera, HIGH_X)
-    slopes_y = simd.load_one(camera, LOW_Y), simd.load_one(camera, HIGH_Y)
-    return rotation, load3(camera, TRANSLATION), focal, slopes_x, slopes_y
+    rotation = get3(camera, ROTATION), get3(camera, ROTATION + 3), get3(camera, ROTATION + 6)
+    focal = simd.get(camera, FX), simd.get(camera, FY)
+    slopes_x = simd.get(camera, LOW_X), simd.get(camera, HIGH_X)
+    slopes_y = simd.get(camera, LOW_Y), simd.get(camera, HIGH_Y)
+    return rotation, get3(camera, TRANSLATION), focal, slopes_x, slopes_y

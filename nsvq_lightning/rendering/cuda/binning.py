@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
+from nsvq_lightning.compute.rows import sorted_by_key
 
 
 class Tiles(NamedTuple):
@@ -49,7 +50,7 @@ def expand_kernel(boxes, ends, keys, owners, total, count, halvings, columns, BL
     width = tl.load(box + 2, mask=inside, other=1)
     place = (pair - begin).to(tl.int32)
     tile = (y0 + place // width) * columns + x0 + place % width
-    tl.store(keys + pair, tile.to(keys.dtype.element_ty), mask=inside)
+    tl.store(keys + pair, tile, mask=inside)
     tl.store(owners + pair, low, mask=inside)
 
 
@@ -84,16 +85,12 @@ def tiles_of(boxes: Tensor, ends: Tensor, total: int, columns: int, rows: int) -
     """
     check_tensor("boxes", boxes, (len(boxes), 4), boxes.device, torch.int32)
     check_tensor("ends", ends, (len(boxes),), boxes.device, torch.int32)
-    device, tiles = boxes.device, columns * rows
-    # 16-bit keys take a quarter of the sorting passes of 64-bit ones.
-    key = torch.int16 if tiles < 2**15 else torch.int32
-    keys, owners = (boxes.new_empty(total, dtype=kind) for kind in (key, torch.int32))
+    keys, owners = (boxes.new_empty(total) for _ in range(2))
     if total:
         block = 512  # pairs per program
         expand_kernel[(triton.cdiv(total, block),)](
             boxes, ends, keys, owners, total, len(boxes), len(boxes).bit_length(), columns, BLOCK=block, **COMPILE
         )
-    keys, slots = keys.sort(stable=True)
-    offsets = torch.searchsorted(keys, torch.arange(tiles + 1, dtype=key, device=device), out_int32=True)
+    slots, offsets = sorted_by_key(keys, columns * rows)
     order = offsets.diff().argsort(descending=True, stable=True)
     return Tiles(offsets, order.int(), owners[slots], slots.int(), ends)
