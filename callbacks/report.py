@@ -217,7 +217,6 @@ class MetricReport(WritingCallback):
         if self.pictures:
             path = picture_file(trainer, run_folder(trainer) / "renders", batch.name)
             with optional(path):
-                path.parent.mkdir(exist_ok=True)
                 pictures.write_png(path, pictures.comparison(image, photo))
 
     def on_test_end(self, trainer: Trainer, module: SplatModule) -> None:

@@ -8,6 +8,8 @@ Examples:
 """
 
 import argparse
+import io
+import shutil
 import sys
 import tempfile
 import webbrowser
@@ -185,9 +187,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
-        part = 1 << 16  # for each of which a slow client has the whole timeout
-        for start in range(0, len(content), part):
-            self.wfile.write(content[start : start + part])
+        # A slow client has the whole timeout for each part.
+        shutil.copyfileobj(io.BytesIO(content), self.wfile, 1 << 16)
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing of each request."""

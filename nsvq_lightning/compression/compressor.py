@@ -185,11 +185,8 @@ class Compressor:
     def __post_init__(self) -> None:
         self._splats = self.scene.tensors()
         self._render = partial(render, antialiased=self.scene.antialiased)
-        known = self.photos.train_cameras if self.photos else self.cameras
-        self._known = tuple(known)
-        if not self.cameras:
-            self.cameras = known or square_views(self._splats, VIEWS)
-        self.cameras = spread(self.cameras, VIEWS)
+        self._known = self.photos.train_cameras if self.photos else self.cameras
+        self.cameras = spread(self.cameras or self._known or square_views(self._splats, VIEWS), VIEWS)
         self._is_own = self.photos is None or self.photos.split == OWN
         if not self._is_own and (likeness := self._psnr(self._splats)) < MIN_PSNR:
             raise ValueError(f"photos of {self.data.scene.root} are not of this scene: it has {likeness:.1f} dB there")

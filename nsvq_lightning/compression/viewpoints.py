@@ -13,6 +13,7 @@ from nsvq_lightning.data.images import ImageStore, Picture
 from nsvq_lightning.data.points import in_picture
 from nsvq_lightning.data.scene import Scene, spread
 from nsvq_lightning.io.morton import spatial_order
+from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.rendering.camera import Camera, camera_of
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
@@ -110,7 +111,7 @@ def own_scene(
         raise ValueError(f"expected a photo [H, W, 3] of its size for each of {len(cameras)} cameras")
     split = "1 in 8" if photos else OWN
     bytes_ = [
-        photo.cpu() if photo.dtype == torch.uint8 else (255 * photo.cpu().clamp(0, 1)).round().to(torch.uint8)
+        (255 * eight_bit(photo.cpu())).round().to(torch.uint8)
         for photo in photos or pictures(splats, cameras, antialiased)
     ]
     centres = poses(cameras)[0]

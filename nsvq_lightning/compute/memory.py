@@ -71,6 +71,16 @@ def outside(name: str, numbers: Array, count: int) -> ValueError:
     return ValueError(f"{name} must be in [0, {count}), got {numbers.min()} to {numbers.max()}")
 
 
+def check_inside(name: str, numbers: Array, count: int) -> None:
+    """Refuse numbers that are not rows of a table of ``count`` rows.
+
+    Raises:
+        ValueError: One is not.
+    """
+    if numbers.size and (numbers.min() < 0 or numbers.max() >= count):
+        raise outside(name, numbers, count)
+
+
 class Workspace:
     """Named scratch arrays that only grow. Their content is whatever the last user left.
 

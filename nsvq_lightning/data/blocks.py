@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from nsvq_lightning.data.colmap import SceneError
+from nsvq_lightning.data.images import write_pixels
 from nsvq_lightning.data.points import projected
 from nsvq_lightning.data.scene import Scene
-from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
+from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.io.errors import Json
 from nsvq_lightning.io.placing import turn_up
 from nsvq_lightning.io.ply import write_elements
@@ -50,13 +51,13 @@ class Block:
     around: Sequence[Sequence[float]]
     scene: str
 
-    def contains(self, points: NDArray[np.floating[Any]], share: float = 0.0) -> Bools:
-        """Which points ``[N, 3]`` are in its core, or up to a share of the way to the end of its surroundings.
+    def contains(self, points: NDArray[np.floating[Any]], around: bool = False) -> Bools:
+        """Which points ``[N, 3]`` are in its core, or in that with its surroundings.
 
         Cores have no point in common, and each point is in one.
         """
         ground = points @ np.array(self.axes).T
-        low, high = (1 - share) * np.array(self.core) + share * np.array(self.around)
+        low, high = self.around if around else self.core
         return np.asarray(((ground >= low) & (ground < high)).all(1))
 
     @classmethod
@@ -184,7 +185,7 @@ def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path])
         OSError: A file cannot be written.
     """
     points = scene.points.double().numpy()
-    insides = [block.contains(points, 1.0) for block in blocks]
+    insides = [block.contains(points, around=True) for block in blocks]
     # Of each part, the train and the test photos, as frames of ``transforms.json``.
     frames: list[tuple[list[Json], list[Json]]] = [([], []) for _ in blocks]
     for index, camera in enumerate(scene.cameras):
@@ -234,8 +235,6 @@ def shown(front: _Front, inside: Bools, camera: Camera) -> Bools:
     empty.flat[cells] = False
     here = np.zeros((rows, columns), np.uint8)
     here.flat[cells[inside[points]]] = 1
-    if not here.any():
-        return np.zeros((camera.height, camera.width), bool)
     # A cell without points shows what the nearest one with points does.
     nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
     grid = cv2.dilate(here[tuple(nearest)], np.ones((3, 3), np.uint8))
@@ -248,9 +247,9 @@ def _write_photo(folder: Path, index: int, image: Uint8s, mask: Bools, camera: C
     left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
     box = slice(top, top + height), slice(left, left + width)
     photo = f"images/{index:05}.png"
-    _write_png(folder / photo, image[box][..., ::-1])
+    write_pixels(folder / photo, image[box][..., ::-1])
     kept = f"masks/{index:05}.png"
-    _write_png(folder / kept, 255 * mask[box].astype(np.uint8))
+    write_pixels(folder / kept, 255 * mask[box].astype(np.uint8))
     fx, fy, cx, cy = camera.intrinsics
     # The file has the inverse, y up, z backward.
     pose = np.linalg.inv(camera.viewmat.double().numpy()) * (1, -1, -1, 1)
@@ -265,8 +264,3 @@ def _write_photo(folder: Path, index: int, image: Uint8s, mask: Bools, camera: C
         "cy": cy - top,
         "transform_matrix": pose.tolist(),
     }
-
-
-def _write_png(path: Path, pixels: Uint8s) -> None:
-    make_folder_of(path)
-    write_bytes(path, cv2.imencode(".png", np.ascontiguousarray(pixels))[1].tobytes())

@@ -10,7 +10,6 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.images import edges_of, resized
 from nsvq_lightning.data.points import in_picture, projected
 from nsvq_lightning.data.scene import Scene, in_parallel, spread
@@ -107,10 +106,7 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     crowd = counts[cell]
     weight = np.where(crowd >= MIN_AGREEING, (detail / 255 + MIN_DETAIL) / crowd**CROWDED, 0)
     drawn = draw_rows(torch.from_numpy(weight), count, generator(seed, 0, "dense start")).numpy()
-    chosen = torch.from_numpy(positions[drawn]).float(), torch.from_numpy(colors[drawn]).float() / 255
-    del positions, colors, detail, cells, cell, counts, crowd, weight
-    trim()
-    return chosen
+    return torch.from_numpy(positions[drawn]).float(), torch.from_numpy(colors[drawn]).float() / 255
 
 
 # Photos are looked at with at most so many pixels on their longer side.

@@ -19,6 +19,7 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.data.colmap import Pinhole, SceneError
 from nsvq_lightning.data.undistortion import Undistortion
+from nsvq_lightning.io.atomic import make_folder_of, write_bytes
 from nsvq_lightning.splats.conventions import Arrays, Bools, Uint8s
 
 # Pillow refuses twice as many, and by default fewer than phones have.
@@ -415,3 +416,9 @@ class ImageStore:
 
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_coming": {}}
+
+
+def write_pixels(path: Path, pixels: Uint8s) -> None:
+    """Write pixels ``[H, W]`` or ``[H, W, 3]`` BGR as PNG, atomically, and make the folder."""
+    make_folder_of(path)
+    write_bytes(path, cv2.imencode(".png", np.ascontiguousarray(pixels))[1].tobytes())

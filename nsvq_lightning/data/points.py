@@ -32,10 +32,9 @@ def read_points(path: Path) -> tuple[Float64s, Uint8s]:
             raise FormatError(f"{path}: its vertices have no {', '.join(missing)}")
         rgb = next((names for names in _COLORS if known.keys() >= {*names}), ())
         names = [known[name] for name in (*"xyz", *rgb)]
-        parts = list(read_ply_columns(path, header, names, np.float64))
+        table = np.concatenate([*read_ply_columns(path, header, names, np.float64)])
     except FormatError as error:
         raise SceneError(f"points {error}") from error
-    table = np.concatenate([np.zeros((0, len(names))), *parts])
     xyz, values = table[:, :3], table[:, 3:]
     if not rgb:
         return xyz, np.full_like(xyz, 128, np.uint8)

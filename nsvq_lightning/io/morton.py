@@ -7,7 +7,7 @@ import numpy as np
 from numba import uint64
 
 from nsvq_lightning.compute.jit import inline, kernel
-from nsvq_lightning.compute.memory import INT64, UINT64, check_array, outside
+from nsvq_lightning.compute.memory import INT64, UINT64, check_array, check_inside
 from nsvq_lightning.io.numbers import power_above, power_below
 from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int32s, Int64s, Integers, Uint64s
 
@@ -98,8 +98,7 @@ def morton_keys(cells: Int64s, depths: Int64s) -> Uint64s:
 def check_depths(depths: Int64s, largest: int) -> None:
     """Refuse depths that are not ``[N]`` contiguous int64 in 0 to ``largest``."""
     check_array("depths", depths, (depths.size,), INT64)
-    if depths.size and (depths.min() < 0 or depths.max() > largest):
-        raise outside("depths", depths, largest + 1)
+    check_inside("depths", depths, largest + 1)
 
 
 def unmorton(keys: Uint64s) -> Int64s:

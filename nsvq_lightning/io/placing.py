@@ -76,11 +76,13 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     def turned_harmonics(rows: Float32s) -> Arrays:
         return (harmonics @ rows.reshape(len(rows), len(harmonics), 3)).reshape(rows.shape)
 
-    has_origin = any(scene.origin)
-    means = scene.means @ linear.T + (0 if has_origin else shift)
-    origin = linear @ scene.origin + (shift if has_origin else 0)
+    origin = linear @ scene.origin
+    if any(scene.origin):  # which moves, then, and not what is relative to it
+        origin += shift
+        shift = np.zeros(3)
+    means = scene.means @ linear.T + shift
     cameras = scene.cameras.copy()
-    cameras[:, :3] = cameras[:, :3] @ linear.T + (0 if has_origin else shift)
+    cameras[:, :3] = cameras[:, :3] @ linear.T + shift
     return scene.changed(
         {
             "scales": lambda rows: rows + np.log(size),

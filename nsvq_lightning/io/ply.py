@@ -328,7 +328,7 @@ def read_ply_columns(
         if header.encoding == "ascii":
             yield _read_ascii(file, header)[:, columns].astype(dtype)
             return
-        for start in range(0, header.count, _ROWS):
+        for start in range(0, max(1, header.count), _ROWS):
             rows = min(_ROWS, header.count - start)
             table = np.fromfile(file, header.dtype, rows)
             if len(table) < rows:
@@ -352,22 +352,19 @@ def _read_ascii(file: BinaryIO, header: PlyHeader) -> Float64s:
 def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, Arrays]:
     """Rows ``[N, D]`` of each attribute of a compressed ``.ply``."""
     chunk = header.others["chunk"]
-    chunks = _table(path, chunk)
-    vertices = _table(path, header)
-    bounds = np.stack([chunks[name] for name in _bounds(chunk)], axis=1)
+    vertices = np.fromfile(path, header.dtype, header.count, offset=header.offset)
+    bounds = np.concatenate([*read_ply_columns(path, chunk, _bounds(chunk))])
     rows = {name: np.empty((header.count, dim), np.float32) for name, dim in attribute_dims(0).items()}
     for start in range(0, header.count, _ROWS):
         several = slice(start, start + _ROWS)
         for name, part in _of_chunks(vertices[several], bounds[start // _CHUNK :]).items():
             rows[name][several] = part
     if sh_degree:
-        levels = _table(path, header.others["sh"])
+        names = _needed(header, sh_degree)["shN"]
+        levels = np.concatenate([*read_ply_columns(path, header.others["sh"], names, np.uint8)])
         # Bytes stand for the middles of 256ths, the first and the last for the ends.
         values = (8 * (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1] - 0.5)).astype(np.float32)
-        names = _needed(header, sh_degree)["shN"]
-        rows["shN"] = np.empty((header.count, len(names)), np.float32)
-        for column, name in zip(rows["shN"].T, names, strict=True):
-            column[:] = values[levels[name]]
+        rows["shN"] = values[levels]
     return rows
 
 
@@ -389,11 +386,6 @@ def _of_chunks(vertices: NDArray[np.void], bounds: Float32s) -> dict[str, Float6
     for part, low, high in zip(rows.values(), ends[::2], ends[1::2], strict=False):
         part[:] = low * (1 - part) + high * part
     return rows | {"sh0": (rows["sh0"] - 0.5) / SH_C0}
-
-
-def _table(path: StrPath, header: PlyHeader) -> NDArray[np.void]:
-    """The rows of an element of a binary file."""
-    return np.fromfile(path, header.dtype, header.count, offset=header.offset)
 
 
 def _for_each(bounds: Float32s, count: int) -> Float64s:

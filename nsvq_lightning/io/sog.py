@@ -303,10 +303,9 @@ def _palette(scene: CompressedScene, most: int) -> tuple[Float32s, Int64s]:
 
     if "shN" not in scene.codes:
         return in_order_of_use(*find_palette(scene.rows("shN"), _visibility(scene), most))
-    used, codes = np.unique(scene.codes["shN"], return_inverse=True)
-    rows = scene.codebooks["shN"][used]
-    if len(used) <= PALETTE_LIMIT:
-        return in_order_of_use(rows, codes)
+    rows, codes = in_order_of_use(scene.codebooks["shN"], scene.codes["shN"])
+    if len(rows) <= PALETTE_LIMIT:
+        return rows, codes
     rows, labels = find_palette(rows, np.bincount(codes, _visibility(scene)), most)
     return in_order_of_use(rows, labels[codes])
 

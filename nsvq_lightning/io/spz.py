@@ -181,11 +181,10 @@ def zstd_decompress(data: memoryview, size: int) -> bytes:
     zstd = _zstd()
     stream = zstd.ZstdDecompressor()
     try:
-        content: bytes = stream.decompress(data, size)
-        beyond = b"" if stream.eof else stream.decompress(b"", 1)
+        content: bytes = stream.decompress(data, size + 1)
     except zstd.ZstdError as error:
         raise FormatError(f"damaged: no valid Zstandard stream ({error})") from None
-    if len(content) < size or beyond or not stream.eof or stream.unused_data:
+    if len(content) != size or not stream.eof or stream.unused_data:
         raise FormatError(f"damaged: a Zstandard stream does not hold the {size} bytes that it should")
     return content
 

@@ -22,7 +22,8 @@ import torch
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
-from nsvq_lightning.io.atomic import atomic_path, atomic_write, make_folder_of, write_bytes
+from nsvq_lightning.data.images import read_image, write_pixels
+from nsvq_lightning.io.atomic import atomic_path, atomic_write, make_folder_of
 from nsvq_lightning.splats.conventions import Uint8s
 from nsvq_lightning.training.schedule import Phase, Schedule
 
@@ -77,8 +78,8 @@ def as_bytes(image: Tensor) -> Uint8s:
 
 
 def write_png(path: Path, image: Tensor) -> None:
-    """Write an RGB image ``[H, W, 3]`` in [0, 1] as 8-bit PNG, atomically."""
-    write_bytes(path, cv2.imencode(".png", cv2.cvtColor(as_bytes(image), cv2.COLOR_RGB2BGR))[1].tobytes())
+    """Write an RGB image ``[H, W, 3]`` in [0, 1] as 8-bit PNG, atomically, and make its folder."""
+    write_pixels(path, as_bytes(image)[..., ::-1])
 
 
 def log_pictures(loggers: Sequence[Logger], pictures: Sequence[Path], step: int) -> None:
@@ -95,8 +96,7 @@ def log_pictures(loggers: Sequence[Logger], pictures: Sequence[Path], step: int)
             logger.log_image("test/views", [str(path) for path in pictures], step, caption=names)
         elif isinstance(logger, TensorBoardLogger):
             for path in pictures:
-                image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
-                logger.experiment.add_image(f"test/{path.stem}", image, step, dataformats="HWC")
+                logger.experiment.add_image(f"test/{path.stem}", read_image(path), step, dataformats="HWC")
 
 
 @contextmanager

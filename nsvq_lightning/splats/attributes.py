@@ -105,9 +105,9 @@ def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int
         if isinstance(rows, np.ndarray):
             masks[name] = np.isfinite(rows).all(1)
         else:  # torch makes a copy on the way
-            masks[name] = rows.new_ones(len(rows)).bool()
-            for mask, part in zip(masks[name].split(ROWS), rows.split(ROWS), strict=True):
-                mask.copy_(part.isfinite().all(1))
+            import torch
+
+            masks[name] = torch.cat([part.isfinite().all(1) for part in rows.split(ROWS)])
     culprits = {name: len(mask) - int(mask.sum()) for name, mask in masks.items() if not mask.all()}
     return reduce(and_, masks.values()), culprits
 

@@ -10,6 +10,7 @@ from lightning.pytorch import Trainer
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.dense_start import dense_points, far_points
 from nsvq_lightning.data.scene import ONE_PLACE, Scene, View, spread
 from nsvq_lightning.io.formats import read_scene
@@ -145,6 +146,7 @@ def _with_dense_points(scene: Scene, missing: int, seed: int) -> tuple[Tensor, T
     log.info("dense start: looking for %d points that neighbouring photos show, beside those of SfM", missing)
     start, known = time.perf_counter(), len(scene.points)
     points, colors = dense_points(scene, missing, seed)
+    trim()
     log.info("dense start: %d points beside %d of SfM, %.1f s", len(points), known, time.perf_counter() - start)
     if len(points) == 0:
         log.warning("neighbouring photos show nothing that could be followed: training starts from SfM's points")

@@ -24,7 +24,7 @@ def test_cores_have_each_point_once_and_photos_show_as_much_of_each(scene: Scene
     for places in (points, anywhere):
         assert (np.sum([block.contains(places) for block in blocks], axis=0) == 1).all()
     for block in blocks:
-        core, around = block.contains(points), block.contains(points, 1.0)
+        core, around = block.contains(points), block.contains(points, around=True)
         assert (core <= around).all()
         assert count == 1 or core.sum() < around.sum()
     weights = np.zeros(len(points))
@@ -62,7 +62,7 @@ def test_a_part_is_a_scene_with_the_same_cameras_and_split(scene: Scene, tmp_pat
         assert Block.read(folder) == block
         part = load_scene(folder)
         assert (len(part.train), len(part.test)) == (train, test)
-        inside = block.contains(scene.points.double().numpy(), 1.0)
+        inside = block.contains(scene.points.double().numpy(), around=True)
         torch.testing.assert_close(part.points, scene.points[torch.from_numpy(inside)])
         torch.testing.assert_close(part.colors, scene.colors[torch.from_numpy(inside)], atol=0.5 / 255, rtol=0)
         for number in (part.test[0], part.train[-1]):

@@ -10,7 +10,7 @@ import numpy as np
 from numba import uint64
 
 from nsvq_lightning.compute.jit import inline, kernel
-from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array, outside
+from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array, check_inside
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.morton import check_depths
 from nsvq_lightning.io.nsvq import range_coder as rc
@@ -146,8 +146,7 @@ def encode_integers(values: Integers, order: Int64s | None = None) -> bytes:
         raise ValueError(f"values must have shape [N, D] and be below 2^52 in size, got {list(values.shape)}")
     order = np.arange(len(values)) if order is None else order
     check_array("order", order, (len(values),), INT64)
-    if order.size and (order.min() < 0 or order.max() >= len(values)):
-        raise outside("order", order, len(values))
+    check_inside("order", order, len(values))
     bits = np.empty((_MODES, values.shape[1]), np.int64)  # about as many as each mode takes
     left = np.zeros(len(order), np.int64)
     for column, numbers in enumerate(values.T):

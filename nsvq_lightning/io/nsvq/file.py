@@ -152,9 +152,10 @@ def paper_header(scene: CompressedScene) -> Header:
     its codebook. The header is the 32-byte prefix and the JSON.
     """
     dims = attribute_dims(scene.sh_degree)
-    rows = {name: len(codebook) for name, codebook in scene.codebooks.items()}
+    books = scene.codebooks
     attributes = tuple(
-        AttributeEntry(name, dims[name], "codes" if name in rows else "raw", rows.get(name, 0)) for name in _ORDER
+        AttributeEntry(name, dims[name], "codes" if name in books else "raw", len(books.get(name, ())))
+        for name in _ORDER
     )
     return Header.of(scene, "paper", attributes, _layout(len(scene), attributes))
 

@@ -163,16 +163,11 @@ def tree_order(codebook: Float32s) -> Int64s:
 
 def leaf_paths(count: int) -> Int64s:
     """Path ``[count]`` of each leaf, ascending: the halves taken from the root, ⌈log2 count⌉ bits, 0 after the leaf."""
-    low, high = np.zeros(count, np.int64), np.full(count, count, np.int64)
-    paths = np.zeros(count, np.int64)
-    leaves = np.arange(count)
+    # How many leaves are below each node of a level, 0 where none is.
+    leaves = np.array([count])
     for _ in range((count - 1).bit_length()):
-        cut = low + (high - low + 1) // 2
-        right = (leaves >= cut) & (high - low > 1)
-        low = np.where(right, cut, low)
-        high = np.where(right, high, np.minimum(cut, high))
-        paths = 2 * paths + right
-    return paths
+        leaves = np.stack([(leaves + 1) // 2, leaves // 2], axis=1).ravel()
+    return leaves.nonzero()[0]
 
 
 def sibling_distance(ordered: Float32s) -> float:
