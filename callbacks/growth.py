@@ -290,7 +290,8 @@ class BudgetedGrowth(Densification):
         progress = min(max((reference - self.start) / (self.full - self.start), 0.0), 1.0)
         room = int(self.limit(module) * math.sqrt(progress)) - len(splats)
         divided = draw_rows(candidates, room, generator(module.seed, iteration, "grow"))
-        return room, self.divide(module, divided, split_longest(detached(splats).take(divided)))
+        parents = detached(splats).take(divided)
+        return room, self.divide(module, divided, split_longest(parents))
 
 
 def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:

@@ -42,7 +42,8 @@ def unknown_option(message: str, options: Iterable[str]) -> str:
 
 def names(text: str) -> tuple[str, ...]:
     """The entries of ``A,B``, each once; an empty one if there is none."""
-    return tuple(dict.fromkeys(filter(None, (part.strip() for part in text.split(","))))) or ("",)
+    entries = (part.strip() for part in text.split(","))
+    return tuple(dict.fromkeys(filter(None, entries))) or ("",)
 
 
 def some_of(known: Iterable[str]) -> Callable[[str], tuple[str, ...]]:

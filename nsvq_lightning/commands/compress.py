@@ -51,7 +51,8 @@ def splats_left(asked: float | None, count: int) -> int:
     """How many of ``count`` splats a result of :func:`share_or_number` leaves; all if it is None."""
     if asked is None:
         return count
-    return min(count, max(1, round(asked * count if asked <= 1 else asked)))
+    number = asked * count if asked <= 1 else asked
+    return min(count, max(1, round(number)))
 
 
 def written_error(measure: "Measure", error: float, original: str) -> str:

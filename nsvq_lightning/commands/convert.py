@@ -177,7 +177,8 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     look = partial(render, antialiased=scene.antialiased)
 
     def psnr(keep: torch.Tensor) -> float:
-        return evaluate(look, splats.take(keep), map(photos.view, photos.test))[0]
+        kept = splats.take(keep)
+        return evaluate(look, kept, map(photos.view, photos.test))[0]
 
     removed = floaters(splats, lambda: map(photos.view, tqdm(photos.train, unit=" photos", mininterval=1)), look)
     before, after = psnr(torch.ones_like(removed)), psnr(~removed)

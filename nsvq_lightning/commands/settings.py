@@ -203,7 +203,8 @@ def check_config(path: str) -> dict[str, Any]:
         raise ValueError(f"config {path} has {size} bytes, more than {MAX_BYTES}: give another file")
     try:
         # Not the parser's loader: what is nested too deep would overflow its stack.
-        settings = yaml.SafeLoader(file.read_text(encoding="utf-8")).get_single_data()
+        loader = yaml.SafeLoader(file.read_text(encoding="utf-8"))
+        settings = loader.get_single_data()
         json.dumps(settings, default=str)  # refuses what holds itself
     except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error

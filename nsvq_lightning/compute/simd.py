@@ -40,7 +40,8 @@ class _VectorType(types.Type):
 
     def can_convert_from(self, typingctx, other):
         """A number where ``Lanes`` are expected is spread to every lane, if nothing else takes a number there."""
-        return Conversion.unsafe if self == Lanes and isinstance(other, types.Integer | types.Float) else None
+        is_number = isinstance(other, types.Integer | types.Float)
+        return Conversion.unsafe if self == Lanes and is_number else None
 
 
 Lanes = _VectorType("float32x16")

@@ -154,7 +154,8 @@ def cut(scene: Scene, count: int) -> list[Block]:
             return parts(some & inside, inner, outer, share)
 
         low = side(below, 1, min(upper, seam + reach), first)
-        return low + side(~below, 0, max(lower, seam - reach), number - first)
+        high = side(~below, 0, max(lower, seam - reach), number - first)
+        return low + high
 
     everywhere = np.array([[-_FAR] * 2, [_FAR] * 2])
     return parts(np.ones(len(points), bool), everywhere, everywhere, count)

@@ -88,7 +88,8 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     try:
         photos = in_parallel(lambda index: _photo(scene, index, known), scene.train, "dense start: photos")
         pairs = _neighbours(photos)
-        stride = max(2, math.ceil(math.sqrt(2 * len(pairs) * photos[0].grey.size / MAX_CANDIDATES)))
+        pixels = 2 * len(pairs) * photos[0].grey.size
+        stride = max(2, math.ceil(math.sqrt(pixels / MAX_CANDIDATES)))
         found = in_parallel(lambda pair: _triangulated(*pair, stride), pairs, "dense start: flows")
     finally:
         cv2.setNumThreads(threads)
@@ -116,7 +117,8 @@ MAX_SIDE = 800
 def _photo(scene: Scene, index: int, known: Float64s) -> _Photo:
     camera = scene.cameras[index]
     image, mask = scene.images[index]
-    width, height = (round(side * min(1.0, MAX_SIDE / max(camera.size))) for side in camera.size)
+    scale = min(1.0, MAX_SIDE / max(camera.size))
+    width, height = (round(side * scale) for side in camera.size)
     pixels, counts = resized(image.numpy(), None if mask is None else mask.numpy(), (width, height))
     edges = edges_of(torch.from_numpy(pixels), None if counts is None else torch.from_numpy(counts))
     view = camera.viewmat.double().numpy()

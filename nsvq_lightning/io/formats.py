@@ -134,7 +134,8 @@ def describe(path: StrPath) -> Json:
 
 def suffix_of(path: StrPath) -> str:
     """The longest end of a file's name, in lower case, that is a key of :data:`FORMATS`; empty if none is."""
-    return max((suffix for suffix in FORMATS if Path(path).name.lower().endswith(suffix)), key=len, default="")
+    name = Path(path).name.lower()
+    return max((suffix for suffix in FORMATS if name.endswith(suffix)), key=len, default="")
 
 
 def format_of(path: StrPath) -> Format:

@@ -74,7 +74,8 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     harmonics = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
 
     def turned_harmonics(rows: Float32s) -> Arrays:
-        return (harmonics @ rows.reshape(len(rows), len(harmonics), 3)).reshape(rows.shape)
+        coefficients = rows.reshape(len(rows), len(harmonics), 3)
+        return (harmonics @ coefficients).reshape(rows.shape)
 
     origin = linear @ scene.origin
     if any(scene.origin):  # which moves, then, and not what is relative to it

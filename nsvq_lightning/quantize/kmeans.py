@@ -194,6 +194,7 @@ def rows_far_apart(rows: Tensor, count: int, generator: torch.Generator) -> Tens
     while len(chosen) < count:
         far = draw_far_rows(rows, rows[chosen], min(len(chosen), count - len(chosen)), generator)
         if len(far) == 0:
-            return rows[torch.cat([chosen, order[~torch.isin(order, chosen)][: count - len(chosen)]])]
+            rest = order[~torch.isin(order, chosen)]
+            return rows[torch.cat([chosen, rest[: count - len(chosen)]])]
         chosen = torch.cat([chosen, far])
     return rows[chosen]

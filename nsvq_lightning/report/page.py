@@ -176,7 +176,8 @@ def _jpeg(picture: MatLike) -> str:
     """A picture as an address that holds it."""
     factor = min(1.0, 1000 / max(picture.shape[:2]))
     picture = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    return data_address("jpeg", cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
+    encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1]
+    return data_address("jpeg", encoded.tobytes())
 
 
 def _decibels(psnr: float | None) -> str:
@@ -188,4 +189,6 @@ def _duration(seconds: float) -> str:
     hours, minutes = divmod(minutes, 60)
     if hours:
         return f"{hours} h {minutes} min"
-    return f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"
+    if minutes:
+        return f"{minutes} min {rest} s"
+    return f"{seconds:.1f} s"

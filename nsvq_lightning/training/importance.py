@@ -94,7 +94,8 @@ def _drawn(signs: torch.Generator, image: Tensor) -> Tensor:
 def below_cap(splats: SplatTensors) -> RawSplats:
     """The splats, detached, with opacities below the rasterizer's cap, where pixels have no gradient."""
     raw = detached(splats)
-    return raw._replace(opacities=raw.opacities.clamp_max(torch.logit(torch.tensor(ALPHA_MAX - 0.01)).item()))
+    limit = torch.logit(torch.tensor(ALPHA_MAX - 0.01)).item()
+    return raw._replace(opacities=raw.opacities.clamp_max(limit))
 
 
 def by_opacity(opacities: Tensor) -> Tensor:
@@ -121,7 +122,8 @@ def likely_effects(splats: RawSplats, squares: Tensor) -> Tensor:
     size = (splats.scales.topk(2).values.sum(1) / 3).exp()
     typical = splats.opacities.sigmoid().square() * size
     typical *= (effects / typical)[effects > 0].median()
-    return effects.fmax(MIN_EFFECT * typical) ** TRUST * typical ** (1 - TRUST)
+    counted = effects.fmax(MIN_EFFECT * typical)
+    return counted**TRUST * typical ** (1 - TRUST)
 
 
 def floaters(splats: SplatTensors, views: Callable[[], Iterable[View]], render: Renderer) -> Tensor:

@@ -164,4 +164,6 @@ def background_of(scene: Scene, asked: str) -> str:
             f"the photos of {scene.root} are transparent around their objects and are shown on white, "
             f"model.background is {asked}: leave it at auto"
         )
-    return ("white" if scene.white else "black") if asked == "auto" else asked
+    if asked != "auto":
+        return asked
+    return "white" if scene.white else "black"

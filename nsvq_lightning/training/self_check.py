@@ -57,7 +57,8 @@ def _step(backend: str, device: str, dtype: torch.dtype) -> dict[str, Tensor]:
     made["scales"] -= 2.5
     photo, codebook = torch.rand(72, 96, 3, generator=draw), torch.randn(100, 4, generator=draw).to(device, dtype)
     splats = RawSplats(**{name: value.to(device, dtype).requires_grad_() for name, value in made.items()})
-    image = render(splats, camera_of(torch.eye(4), (80, 80, 48, 36), 96, 72), backend=backend).image
+    camera = camera_of(torch.eye(4), (80, 80, 48, 36), 96, 72)
+    image = render(splats, camera, backend=backend).image
     loss = photometric_loss(image, photo.to(device, dtype))
     loss.backward()  # type: ignore[no-untyped-call]
     quats, codebook = splats.quats.detach(), codebook.requires_grad_()

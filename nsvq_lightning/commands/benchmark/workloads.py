@@ -129,7 +129,8 @@ def _positions(count: int, rng: np.random.Generator) -> Float64s:
     sphere = _directions(rng, quarter, 3) * 0.9 + rng.normal(size=(quarter, 3)) * 0.02
     x = rng.uniform(-2.2, 2.2, quarter)
     y = 0.9 + rng.normal(size=quarter) * 0.02
-    ground = np.c_[x, y, rng.uniform(-2.2, 2.2, quarter)]
+    z = rng.uniform(-2.2, 2.2, quarter)
+    ground = np.c_[x, y, z]
     box = rng.uniform(-0.4, 0.4, (tenth, 3))
     axis = rng.integers(0, 3, tenth)
     box[np.arange(tenth), axis] = 0.4 * (rng.integers(0, 2, tenth) * 2 - 1)

@@ -127,7 +127,8 @@ def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> Compres
             bases[name] = attribute.floats()
         else:
             raw[name] = attribute.floats()
-    opacities = logits_of((np.arange(levels.entry.codes) + 0.5) / levels.entry.codes)[levels.values]
+    middles = (np.arange(levels.entry.codes) + 0.5) / levels.entry.codes
+    opacities = logits_of(middles)[levels.values]
     return CompressedScene(means, opacities, codes, codebooks, raw, bases=bases, **header.of_scene)
 
 
@@ -141,7 +142,8 @@ def _workers() -> ThreadPoolExecutor:
 
 def _before(count: int) -> Int32s:
     """The two rows ``[N, 2]`` before each row, -1 where there is none."""
-    return np.maximum(np.arange(count, dtype=np.int32)[:, None] - np.array([1, 2], np.int32), np.int32(-1))
+    rows = np.arange(count, dtype=np.int32)[:, None] - np.array([1, 2], np.int32)
+    return np.maximum(rows, np.int32(-1))
 
 
 def _neighbours(keys: Uint64s, depths: Int64s, count: int) -> Int32s:

@@ -177,7 +177,8 @@ def sibling_distance(ordered: Float32s) -> float:
     dense, and so how exactly they must be stored.
     """
     differences = np.diff(ordered.astype(np.float64), axis=0)[::2]
-    return float(np.median(np.sqrt((differences**2).mean(1)))) if differences.size else 0.0
+    distances = np.sqrt((differences**2).mean(1))
+    return float(np.median(distances)) if differences.size else 0.0
 
 
 # Power-iteration steps for the direction of a cut. It need not be exact: 12 would save another 0.02 % of a file.
