@@ -296,7 +296,7 @@ class RateDistortion(SplatCallback):
         """Whether this iteration of the quantize phase begins with a measurement, and the codes of all splats."""
         start, end = module.schedule.ends[Phase.PRUNE], module.schedule.ends[Phase.QUANTIZE]
         every = -(-(end - start) // MEASUREMENTS)
-        return (iteration - 1 - start) % every == 0
+        return module.schedule.phase_at(iteration) is Phase.QUANTIZE and (iteration - 1 - start) % every == 0
 
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Choose the codes of the splats whose turn it is; of all, by a new measurement, when due or some were dropped.

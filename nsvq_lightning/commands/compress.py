@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 LOD_LEVELS = 3
 
 
-def share_or_number(text: str) -> float:
-    """``25%`` as 0.25, ``50000`` as it is.
+def share_or_number(text: str) -> int | float:
+    """``25%`` as 0.25, ``50000`` as it is, an integer.
 
     Raises:
         argparse.ArgumentTypeError: It is neither.
@@ -43,16 +43,16 @@ def share_or_number(text: str) -> float:
         if match[2] and 0 < value <= 100:
             return value / 100
         if not match[2] and value >= 1 and value.is_integer():
-            return value
+            return int(value)
     raise argparse.ArgumentTypeError(f"expected a number of splats, or a share such as 25%, got {text!r}")
 
 
-def splats_left(asked: float | None, count: int) -> int:
+def splats_left(asked: int | float | None, count: int) -> int:
     """How many of ``count`` splats a result of :func:`share_or_number` leaves; all if it is None."""
     if asked is None:
         return count
-    number = asked * count if asked <= 1 else asked
-    return min(count, max(1, round(number)))
+    number = asked if isinstance(asked, int) else round(asked * count)
+    return min(count, max(1, number))
 
 
 def written_error(measure: "Measure", error: float, original: str) -> str:

@@ -211,7 +211,10 @@ def _splats(document: Json, data: memoryview, primitive: Json) -> CompressedScen
         "scales": _logs_of_scale(values(f"{EXTENSION}:SCALE")),
     }
     # In drafts, colours and opacities were those of the points.
-    rows["opacities"] = logits_of(values(OPACITY if OPACITY in names else "COLOR_0")[:, -1])
+    shown = values(OPACITY if OPACITY in names else "COLOR_0")
+    if shown.shape[1] == 3:  # colours without alpha, which is 1
+        shown = np.ones_like(shown)
+    rows["opacities"] = logits_of(shown[:, -1])
     if _harmonic(0) in names:
         rows["sh0"] = values(_harmonic(0))
     else:

@@ -121,7 +121,7 @@ def likely_effects(splats: RawSplats, squares: Tensor) -> Tensor:
     # An opaque splat shows more, a large one hardly: where splats are large, photos were taken from far away.
     size = (splats.scales.topk(2).values.sum(1) / 3).exp()
     typical = splats.opacities.sigmoid().square() * size
-    typical *= (effects / typical)[effects > 0].median()
+    typical *= (effects / typical)[effects > 0].median().nan_to_num(1.0)  # where nothing has an effect
     counted = effects.fmax(MIN_EFFECT * typical)
     return counted**TRUST * typical ** (1 - TRUST)
 

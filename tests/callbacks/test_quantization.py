@@ -18,6 +18,7 @@ from nsvq_lightning.callbacks import (
     CodebookReplacement,
     FreezeCodes,
     OpacityRegularization,
+    RateDistortion,
     ShDegreeSchedule,
 )
 from nsvq_lightning.callbacks.base import keep_finite_splats
@@ -54,6 +55,15 @@ def test_replacement_stops_as_long_before_codes_freeze_as_asked_for() -> None:
         short: Any = SimpleNamespace(schedule=schedule)
         last = max(i for i in range(1, total + 1) if callback.is_due(short, i))
         assert schedule.ends[Phase.QUANTIZE] - last >= round(3000 * schedule.scale)
+
+
+@pytest.mark.parametrize("ends", [{}, {"prune_end": 45_000, "quantize_end": 45_000}])
+def test_measurements_are_due_in_the_quantize_phase_alone(ends: dict[str, int]) -> None:
+    schedule = Schedule(**ends)
+    long: Any = SimpleNamespace(schedule=schedule)
+    due = [i for i in range(1, schedule.total + 1) if RateDistortion().is_due(long, i)]
+    assert all(schedule.phase_at(iteration) is Phase.QUANTIZE for iteration in due)
+    assert len(due) == (0 if ends else 3)
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def test_a_file_is_compressed_and_again_to_the_same_bytes(tmp_path: Path, capsys
     assert read_header(tmp_path / "again.nsvq").level == "paper"
 
 
-@pytest.mark.parametrize(("splats", "left"), [("25%", 100), ("150", 150), ("9000", 400)])
+@pytest.mark.parametrize(("splats", "left"), [("25%", 100), ("150", 150), ("1", 1), ("100%", 400), ("9000", 400)])
 def test_a_share_or_a_number_of_splats_is_left(splats: str, left: int, tmp_path: Path) -> None:
     write_ply(tmp_path / "scene.ply", ball(400, degree=0))
     paths = str(tmp_path / "scene.ply"), str(tmp_path / "x.nsvq")

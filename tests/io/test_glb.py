@@ -199,6 +199,11 @@ def test_drafts_had_colours_and_opacities_in_those_of_the_points(tmp_path: Path)
     back = read_scene(write(tmp_path / "y.glb", document, replaced(document, data, "COLOR_0", colors)))
     np.testing.assert_allclose(0.5 + 0.28209479 * back.values("sh0")[:, 0], colors[:, :3] / 255, atol=1e-6)
     np.testing.assert_allclose(sigmoid(back.opacities), colors[:, 3] / 255, atol=1e-6)
+    view = document["accessors"][names["COLOR_0"]]["bufferView"]
+    document["bufferViews"][view]["byteStride"] = 4
+    opaque = read_scene(write(tmp_path / "z.glb", document, replaced(document, data, "COLOR_0", colors, type="VEC3")))
+    np.testing.assert_array_equal(opaque.values("sh0"), back.values("sh0"))
+    assert (sigmoid(opaque.opacities) > 0.999).all()
 
 
 @pytest.mark.parametrize(("normalized", "unit"), [(True, 127), (False, 1)])

@@ -21,6 +21,7 @@ from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 from nsvq_lightning.training.importance import (
     contributions,
     floaters,
+    likely_effects,
     row_weights,
     sensitivity,
 )
@@ -56,6 +57,14 @@ def test_all_contributions_make_the_alpha_of_the_picture() -> None:
     splats, camera = random_splats(2000), front_camera()
     found = contributions(splats, [camera], rendered)
     torch.testing.assert_close(found.sum(), render(splats, camera).alpha.sum(), rtol=1e-4, atol=0)
+
+
+def test_where_nothing_shows_opaque_and_large_splats_count_most() -> None:
+    splats = detached(random_splats(50))
+    effects = likely_effects(splats, torch.zeros(50))
+    assert torch.isfinite(effects).all()
+    larger = splats._replace(opacities=splats.opacities + 1, scales=splats.scales + 1)
+    assert (likely_effects(larger, torch.zeros(50)) > effects).all()
 
 
 def test_weights_are_never_zero() -> None:

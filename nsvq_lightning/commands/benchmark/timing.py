@@ -9,6 +9,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -183,7 +184,7 @@ def describe_machine() -> list[str]:
     }
     packages = ("numpy", "torch", "numba", "llvmlite", "lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")
     versions = {"nsvq-lightning": __version__, "python": platform.python_version()}
-    versions |= {name: importlib.metadata.version(name) for name in packages}
+    versions |= {name: importlib.metadata.version(name) for name in packages if find_spec(name)}
     return [_listed(machine), _listed(versions)]
 
 

@@ -39,12 +39,14 @@ class StepClock(Callback):
         steps: Phase and milliseconds of every step.
         products: Matrix products in between, ms.
         psnr: Of the test views, in dB, at the end of the last run.
+        splats: How many there are then.
     """
 
     def __init__(self) -> None:
         self.steps: list[tuple[Phase, float]] = []
         self.products: list[float] = []
         self.psnr = 0.0
+        self.splats = 0
         self._product = timing.sgemm()
         self._since = 0.0
 
@@ -60,6 +62,7 @@ class StepClock(Callback):
         self.steps.append((module.phase, took))
         if trainer.global_step == trainer.max_steps:
             self.psnr = _test_psnr(module)
+            self.splats = len(module.splats)
         if trainer.global_step % 8 == 1:
             self.products.append(timing.milliseconds(self._product))
         self._since = time.perf_counter()
@@ -104,7 +107,7 @@ class RegionClock(StepClock):
             if cores:
                 seconds += sum(makespan(parts, cores) + self.regions.wake * (cores > 1) for parts, _ in kernels)
             clock.steps.append((phase, 1000 * seconds))
-        clock.products, clock.psnr = self.products, self.psnr
+        clock.products, clock.psnr, clock.splats = self.products, self.psnr, self.splats
         return clock
 
 
@@ -129,15 +132,12 @@ QUICK_DEMO = ("--data.factor=4",)
 WATCHING = ("report", "export", "predictions", "checkpoint", "progress")
 
 
-def _train(scope: Scope, clock: StepClock) -> int:
+def _train(scope: Scope, clock: StepClock) -> None:
     """Train ``scope.steps`` iterations of the config on the scene, or on the demo scene if that is no folder of photos.
 
     Args:
         scope: Says which config, scene, first splats and length.
         clock: Times the steps.
-
-    Returns:
-        Number of splats at the end.
     """
     if scope.photos is not None:
         data = ["--data=ColmapDataModule", f"--data.root={scope.photos}"]
@@ -160,10 +160,9 @@ def _train(scope: Scope, clock: StepClock) -> int:
                 "--trainer.enable_checkpointing=false",
                 *(f"--callbacks.{name}=null" for name in WATCHING),
             ]
-            module: SplatModule = _Run(arguments, clock).model
+            _Run(arguments, clock)
     finally:
         logging.disable(logging.NOTSET)
-    return len(module.splats)
 
 
 def _config(scope: Scope) -> str:
@@ -181,7 +180,7 @@ def run(scope: Scope) -> Iterator[Measurement]:
     rounds = 1 if scope.quick else 2
     for name in [*variants, *reversed(variants)][: rounds * len(variants)]:
         with switched(**variants[name]):
-            splats = _train(scope, clocks[name])
+            _train(scope, clocks[name])
     if regions is not None:
         parts = RegionClock(regions)
         regions.emulate(max(scope.emulate))
@@ -200,7 +199,7 @@ def run(scope: Scope) -> Iterator[Measurement]:
             "seconds": sum(samples) / 1000 / rounds,
             "times as shipped": clock.relative / shipped.relative,
             **clock.by_phase,
-            "splats": float(splats),
+            "splats": float(clock.splats),
         }
         if name.startswith("no skip"):
             values["saves %"] = 100 * (1 - shipped.relative / clock.relative)

@@ -49,7 +49,7 @@ class Workload:
         K[0, 2] -= left
         K[1, 2] -= top
         gradient = self.image_gradient[top : top + height, left : left + width].contiguous()
-        return replace(self, camera=Camera(K, self.camera.viewmat, width, height), image_gradient=gradient)
+        return replace(self, camera=replace(self.camera, K=K, width=width, height=height), image_gradient=gradient)
 
     def to(self, device: torch.device | str) -> "Workload":
         """The workload with its splats, background and gradient on a device; the camera stays where it is."""

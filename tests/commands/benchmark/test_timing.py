@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import gc
 import time
+from importlib.util import find_spec
 from unittest.mock import Mock
 
 import pytest
@@ -99,3 +100,11 @@ def test_the_machine_is_described() -> None:
     assert f", torch {torch.__version__.partition('+')[0]}" in versions
     assert machine.startswith("cpu ")
     assert "None" not in machine
+
+
+def test_a_package_that_is_not_installed_has_no_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As pycolmap on Linux on ARM64."""
+    monkeypatch.setattr(timing, "find_spec", lambda name: None if name == "pycolmap" else find_spec(name))
+    _, versions = timing.describe_machine()
+    assert "pycolmap" not in versions
+    assert "scipy" in versions

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,8 @@ def test_crop_shows_the_middle_of_the_view() -> None:
     errors = [float((cropped - whole[top : top + 40, 168:232]).abs().mean()) for top in (130, 131)]
     assert errors[0] < 1e-3 < 20 * errors[0] < errors[1]
     assert torch.equal(small.image_gradient, workload.image_gradient[130:170, 168:232])
+    near = replace(workload, camera=replace(workload.camera, near=0.07))
+    assert near.crop(64, 40).camera.near == 0.07
 
 
 def test_scene_file_is_seen_whole_and_without_broken_splats(tmp_path: Path) -> None:

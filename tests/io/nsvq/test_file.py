@@ -173,6 +173,12 @@ def test_a_code_beyond_its_codebook_is_refused(tmp_path: Path) -> None:
         read_nsvq(path)
 
 
+def test_a_pointer_of_git_lfs_says_so(tmp_path: Path) -> None:
+    (tmp_path / "x.nsvq").write_text("version https://git-lfs.github.com/spec/v1\n")
+    with pytest.raises(FormatError, match=r"not the \.nsvq file itself; get it by 'git lfs pull'"):
+        read_nsvq(tmp_path / "x.nsvq")
+
+
 def test_a_newer_version_says_so(tmp_path: Path) -> None:
     path = tmp_path / "x.nsvq"
     write_nsvq(path, scene(4, {}))
