@@ -64,9 +64,8 @@ class ExportScene(WritingCallback):
         if "nsvq" in self.formats and photos is not None:
             page = folder / "viewer.html"
             title = page.resolve().parent.parent.name
-            background = viewer.BACKGROUNDS.get(module.background, viewer.BACKGROUNDS["black"])
             with optional(page):
-                size = viewer.write_viewer(page, folder / "scene.nsvq", viewer.some_cameras(photos), title, background)
+                size = viewer.write_viewer(page, folder / "scene.nsvq", viewer.some_cameras(photos), title)
                 log.info("wrote %s (%d bytes)", page, size)
 
 

@@ -252,6 +252,7 @@ def scene_with_views(
     Raises:
         ValueError: The folder ``root`` is not a scene. What is damaged beside the file is a warning.
     """
+    from nsvq_lightning.io.compressed import on_white
     from nsvq_lightning.rendering.sampling import trained_by
 
     cameras: list[Camera] = []
@@ -266,6 +267,8 @@ def scene_with_views(
     if cameras and not len(scene.cameras):
         log.info("%s: blur and size are those of %d cameras that it was trained by", path, len(cameras))
         scene = replace(scene, cameras=trained_by(cameras))
+    if photos and photos.white:
+        scene = on_white(scene)
     return scene, cameras, photos
 
 

@@ -23,7 +23,7 @@ from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import add_root, cameras_of, trained_scene, views_of
 from nsvq_lightning.commands.compress import share_or_number, splats_left, written_error
 from nsvq_lightning.io import formats, lod, placing, spz
-from nsvq_lightning.io.compressed import CompressedScene, attribute_errors
+from nsvq_lightning.io.compressed import CompressedScene, attribute_errors, on_white, renderer
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.sog import PALETTE_LIMIT
 from nsvq_lightning.splats.conventions import Float64s
@@ -127,7 +127,7 @@ def _edited(scene: CompressedScene, options: argparse.Namespace) -> CompressedSc
     """The scene within the box, without floaters, thinned, turned and moved, up to a degree, in this order."""
     before = len(scene)
     if options.crop is not None:
-        scene = scene.cropped(np.array(options.crop[:3]), np.array(options.crop[3:]))
+        scene = placing.cropped(scene, np.array(options.crop[:3]), np.array(options.crop[3:]))
         if len(scene) == 0:
             named = ", ".join(map(str, options.inputs))
             raise ValueError(f"no splat of {named} is in the box {' '.join(map(str, options.crop))}")
@@ -168,13 +168,12 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     import torch
 
     from nsvq_lightning.data.scene import load_scene
-    from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.report.numbers import evaluate
     from nsvq_lightning.training.importance import floaters
 
     photos = load_scene(root)
     splats = scene.tensors()
-    look = partial(render, antialiased=scene.antialiased)
+    look = renderer(on_white(scene) if photos.white else scene)
 
     def psnr(keep: torch.Tensor) -> float:
         kept = splats.take(keep)
@@ -191,12 +190,11 @@ def _thinned(scene: CompressedScene, count: int, options: argparse.Namespace) ->
     """The splats that contribute most to photos of --data.root, or to the scene's own pictures."""
     from nsvq_lightning.compression.viewpoints import VIEWS
     from nsvq_lightning.random import top_rows
-    from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.training.importance import contributions, row_weights
 
     splats = scene.tensors()
     cameras = views_of(options.inputs[0], splats, VIEWS, options.root)
-    found = contributions(splats, cameras, partial(render, antialiased=scene.antialiased))
+    found = contributions(splats, cameras, renderer(scene))
     return scene.take(top_rows(row_weights(found), count).numpy())
 
 
@@ -206,6 +204,6 @@ def _measure(source: Path, output: Path, root: Path | None) -> None:
 
     original = formats.read_scene(source)
     splats = original.tensors()
-    measure = Measure(splats, views_of(source, splats, MEASURED, root), original.antialiased)
+    measure = Measure(splats, views_of(source, splats, MEASURED, root), renderer(original))
     error = measure.error(formats.read_scene(output).tensors())
     say(f"  {written_error(measure, error, source.name)}")

@@ -6,7 +6,6 @@ Examples:
 
 import argparse
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from nsvq_lightning.commands import say
@@ -28,9 +27,8 @@ def run(options: argparse.Namespace) -> int:
     """
     from nsvq_lightning.data.blocks import BLOCK, Block
     from nsvq_lightning.data.scene import load_scene
-    from nsvq_lightning.io.compressed import CompressedScene
+    from nsvq_lightning.io.compressed import CompressedScene, on_white, renderer
     from nsvq_lightning.io.formats import format_of, read_scene, save
-    from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.report.numbers import evaluate
 
     format_of(options.output)
@@ -55,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
     scene = replace(CompressedScene.joined(parts), origin=photos.frame.origin)
     size = save(scene, options.output)
     say(f"{options.output}: {len(scene):,} splats in {size:,} bytes")
-    look = partial(render, antialiased=scene.antialiased)
+    look = renderer(on_white(scene) if photos.white else scene)
     quality, _ = evaluate(look, scene.tensors(), map(photos.view, photos.test))
     say(f"  test photos of {photos.root}: {quality:.2f} dB")
     return 0

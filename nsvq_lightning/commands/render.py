@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     length("--frames", type=positive(int), metavar="N", help="number of frames, of through and orbit")
     length("--seconds", type=positive(float), metavar="S", help=f"length instead; {SECONDS:g} by default")
     add("--fps", type=positive(float), metavar="F", help=f"frames per second; {FPS:g} by default")
-    add("--background", type=_color, default="black", metavar="COLOR", help="black, white, or R,G,B in [0, 1]")
+    add("--background", type=_color, metavar="COLOR", help="black, white, or R,G,B in [0, 1]; the scene's by default")
     add("--backend", default="auto", metavar="NAME", help="auto, cpu, cuda or reference")
 
 
@@ -95,7 +95,7 @@ def run(options: argparse.Namespace) -> int:
     raw = splats.to(device).raw()
     look = partial(
         render,
-        background=torch.tensor(options.background, device=device),
+        background=torch.tensor(options.background or scene.background, device=device),
         antialiased=scene.antialiased,
         sampling=scene.sampling(),
         backend=options.backend,

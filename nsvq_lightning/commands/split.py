@@ -51,6 +51,9 @@ def run(options: argparse.Namespace) -> int:
     for folder, (train, test) in zip(folders, write_blocks(scene, blocks, folders), strict=True):
         sys.stderr.write(f"{folder}: {train} train and {test} test photos\n")
         root = folder.resolve()
-        fit = ["nsvq", "fit", f"--data.root={root}", f"--trainer.run_folder={root / RUN}", *options.further]
+        fit = ["nsvq", "fit", f"--data.root={root}", f"--trainer.run_folder={root / RUN}"]
+        if scene.white:  # which the photos of parts are in front of
+            fit.append("--model.background=white")
+        fit += options.further
         say(shlex.join(fit))
     return 0

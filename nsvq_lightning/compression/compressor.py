@@ -5,8 +5,8 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, partial
-from typing import Any
+from functools import cache, cached_property
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -31,13 +31,12 @@ from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.datamodule import SceneDataModule
 from nsvq_lightning.data.scene import Scene, spread
-from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.compressed import CompressedScene, on_white, renderer
 from nsvq_lightning.io.morton import spatial_order
 from nsvq_lightning.io.nsvq.file import decode, encode
 from nsvq_lightning.io.nsvq.header import frame, unframe
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.rendering.sampling import trained_by
 from nsvq_lightning.report.numbers import evaluate
 from nsvq_lightning.splats.attributes import (
@@ -184,7 +183,7 @@ class Compressor:
 
     def __post_init__(self) -> None:
         self._splats = self.scene.tensors()
-        self._render = partial(render, antialiased=self.scene.antialiased)
+        self._render = renderer(self.scene)
         self._known = self.photos.train_cameras if self.photos else self.cameras
         self.cameras = spread(self.cameras or self._known or square_views(self._splats, VIEWS), VIEWS)
         self._is_own = self.photos is None or self.photos.split == OWN
@@ -197,12 +196,12 @@ class Compressor:
     @cached_property
     def measure(self) -> Measure:
         """Measures errors."""
-        return Measure(self._splats, self.cameras, self.scene.antialiased)
+        return Measure(self._splats, self.cameras, self._render)
 
     @cached_property
     def data(self) -> SceneDataModule:
         """The views to train on."""
-        return SceneDataModule(self.photos or own_scene(self._splats, self.cameras, self.scene.antialiased), self.seed)
+        return SceneDataModule(self.photos or own_scene(self._splats, self.cameras, self._render), self.seed)
 
     def best(self, splats: int, codebooks: str | None, target_bytes: int | None, max_error: float | None) -> Candidate:
         """The smallest file with an error, the best one of a size, or that with these codebooks; the first asked for.
@@ -373,6 +372,7 @@ class Compressor:
             codebooks=sizes or None,
             # A trained scene is in its place; what is left of some splats moves into that of the others.
             rates=LearningRates(means=4e-5 if prune else LearningRates.means_final),
+            background="white" if any(self.scene.background) else "black",
             antialiased=self.scene.antialiased,
             seed=self.seed,
             storage=self.storage,
@@ -471,6 +471,7 @@ def compress(
     codebooks: str = DEFAULT_SIZE,
     left: int | None = None,
     antialiased: bool = False,
+    background: Literal["black", "white"] = "black",
     **settings: Any,
 ) -> CompressedScene:
     """A scene that was trained elsewhere, made small as ``nsvq compress`` does; :func:`nsvq_lightning.save` writes it.
@@ -486,6 +487,7 @@ def compress(
         codebooks: Instead, the paper's name of their sizes, or ``"none"``.
         left: How many splats are left; None leaves all.
         antialiased: Whether the splats are rendered with anti-aliasing.
+        background: What they are shown in front of, in ``photos``, too.
         settings: ``seed``, ``minutes`` and ``steps`` of :class:`Compressor`.
 
     Raises:
@@ -505,10 +507,12 @@ def compress(
             raise ValueError(f"the splats have no {', '.join(sorted(missing))}")
         scene = CompressedScene.from_rows(rows, antialiased)
     scene = scene.finite()
+    if background == "white":
+        scene = on_white(scene)
     if cameras:
         check_cameras(cameras, scene.means)
         scene = replace(scene, cameras=trained_by(cameras))
-    views = own_scene(scene.tensors(), cameras, scene.antialiased, photos) if photos else None
+    views = own_scene(scene.tensors(), cameras, photos=photos) if photos else None
     compressor = Compressor(scene, cameras, views, **settings)
     left = len(scene) if left is None else min(left, len(scene))
     return compressor.best(left, codebooks, target_bytes, max_error).scene

@@ -22,6 +22,7 @@ from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.rendering.sh import sh_basis
 from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached, sh_degree_of
+from nsvq_lightning.training.importance import Renderer
 
 # Near plane of a guessed camera, as a share of the distance to what it looks at.
 NEARNESS = 0.02
@@ -46,9 +47,9 @@ def look_at(target: Float64s, eye: Float64s, width: int, height: int, angle: flo
 
 
 @torch.no_grad()
-def pictures(splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool = False) -> list[Tensor]:
+def pictures(splats: SplatTensors, cameras: Sequence[Camera], look: Renderer = render) -> list[Tensor]:
     """What each camera sees, ``[H, W, 3]`` in [0, 1]."""
-    return [render(splats, camera, antialiased=antialiased).image.clamp(0, 1) for camera in cameras]
+    return [look(splats, camera).image.clamp(0, 1) for camera in cameras]
 
 
 # Largest number of views in which errors are measured.
@@ -64,25 +65,25 @@ class Measure:
     Args:
         original: Raw attributes.
         cameras: Views, some of which are taken.
-        antialiased: Whether the scene is to be rendered with anti-aliasing.
+        look: How they are rendered.
 
     Raises:
         ValueError: No camera shows any splat.
     """
 
-    def __init__(self, original: SplatTensors, cameras: Sequence[Camera], antialiased: bool = False) -> None:
+    def __init__(self, original: SplatTensors, cameras: Sequence[Camera], look: Renderer = render) -> None:
         self.cameras = spread(cameras, MEASURED)
-        self._antialiased = antialiased
-        self._expected = pictures(original, self.cameras, antialiased)
-        if not any(bool(picture.any()) for picture in self._expected):
+        self._look = look
+        self._expected = pictures(original, self.cameras, look)
+        if all(torch.equal(picture, picture[:1, :1].expand_as(picture)) for picture in self._expected):
             raise ValueError(
-                f"all {len(self.cameras)} pictures of the scene are black, so no error can be measured: its splats are "
+                f"all {len(self.cameras)} pictures of the scene are empty, so no error can be measured: its splats are "
                 "transparent, or photos (--data.root) are of another scene or in other coordinates"
             )
 
     def error(self, splats: SplatTensors) -> float:
         """Root mean square difference for channels in [0, 1]."""
-        found = (pictures(splats, [camera], self._antialiased)[0] for camera in self.cameras)
+        found = (pictures(splats, [camera], self._look)[0] for camera in self.cameras)
         squares = [float((a - b).double().square().mean()) for a, b in zip(found, self._expected, strict=True)]
         return math.sqrt(np.mean(squares))
 
@@ -94,14 +95,14 @@ OWN = "own pictures"
 
 
 def own_scene(
-    splats: SplatTensors, cameras: Sequence[Camera], antialiased: bool = False, photos: Sequence[Tensor] = ()
+    splats: SplatTensors, cameras: Sequence[Camera], look: Renderer = render, photos: Sequence[Tensor] = ()
 ) -> Scene:
     """A scene of given photos, or of pictures of its splats, one of which in eight is not to train on.
 
     Args:
         splats: Raw attributes.
         cameras: Where from, at least one.
-        antialiased: Whether the splats are to be rendered with anti-aliasing.
+        look: How the splats are rendered.
         photos: Of each camera ``[H, W, 3]`` RGB, uint8, or float in [0, 1]; none for the scene's own pictures.
 
     Raises:
@@ -111,8 +112,7 @@ def own_scene(
         raise ValueError(f"expected a photo [H, W, 3] of its size for each of {len(cameras)} cameras")
     split = "1 in 8" if photos else OWN
     bytes_ = [
-        (255 * eight_bit(photo.cpu())).round().to(torch.uint8)
-        for photo in photos or pictures(splats, cameras, antialiased)
+        (255 * eight_bit(photo.cpu())).round().to(torch.uint8) for photo in photos or pictures(splats, cameras, look)
     ]
     centres = poses(cameras)[0]
     frame = Frame.around(centres)

@@ -5,6 +5,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from nsvq_lightning.splats import attributes as splat
 from nsvq_lightning.splats.conventions import Arrays, Bools, Float32s, Float64s, Integers, shN_degree, unit
 
 if TYPE_CHECKING:
+    from nsvq_lightning.rendering.camera import Camera
+    from nsvq_lightning.rendering.rasterize import Render
     from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors
 
 log = logging.getLogger(__name__)
@@ -187,6 +190,11 @@ class CompressedScene:
         """Whether it is to be rendered with anti-aliasing, as it was trained (``antialiased`` of :attr:`config`)."""
         return self.config.get("antialiased") is True
 
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """RGB of what it is shown in front of, as it was trained: white where :attr:`config` says so, else black."""
+        return (1.0, 1.0, 1.0) if self.config.get("background") == "white" else (0.0, 0.0, 0.0)
+
     def sampling(self) -> Sampling | None:
         """How the cameras of training saw the decoded splats; None where they are not known, or with anti-aliasing."""
         import torch
@@ -261,16 +269,6 @@ class CompressedScene:
         """The scene in parts of splats that follow each other (:func:`slices`), at least one."""
         return map(self.take, slices(max(1, len(self))))
 
-    def cropped(self, low: Float64s, high: Float64s) -> "CompressedScene":
-        """The splats whose centres are in a box, its sides included; codebooks stay as they are.
-
-        Args:
-            low: Smallest world coordinates ``[3]``.
-            high: Largest ``[3]``.
-        """
-        positions = self.means + np.array(self.origin)
-        return self.take(((positions >= low) & (positions <= high)).all(1))
-
     def finite_rows(self) -> tuple[Bools, dict[str, int]]:
         """Which splats ``[N]`` have neither NaN nor infinite values, and how many do, by attribute."""
         found: dict[str, Any] = {"means": self.means, "opacities": self.opacities, **self.raw}
@@ -333,6 +331,20 @@ class CompressedScene:
             scene = replace(self, codes=codes, codebooks=codebooks, raw=raw, bases={})
         fitted = {"shN": lambda rows: np.pad(rows[:, :width], ((0, 0), (0, max(0, width - rows.shape[1]))))}
         return scene.changed(fitted, sh_degree=degree)
+
+
+def on_white(scene: CompressedScene) -> CompressedScene:
+    """The same scene, to be shown in front of white."""
+    return replace(scene, config={**scene.config, "background": "white"})
+
+
+def renderer(scene: CompressedScene) -> "Callable[[SplatTensors, Camera], Render]":
+    """:func:`nsvq_lightning.render` with the anti-aliasing and the background of a scene, on the CPU."""
+    import torch
+
+    from nsvq_lightning.rendering.rasterize import render
+
+    return partial(render, background=torch.tensor(scene.background), antialiased=scene.antialiased)
 
 
 def _check_floats(name: str, array: Float32s, shape: tuple[int, ...]) -> None:

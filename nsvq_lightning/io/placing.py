@@ -1,4 +1,4 @@
-"""Scenes turned, scaled and moved, by the rows of their codebooks."""
+"""Scenes turned, scaled, moved and cropped, by the rows of their codebooks."""
 
 from typing import TYPE_CHECKING
 
@@ -101,3 +101,15 @@ def placed(scene: CompressedScene, frame: "Frame") -> CompressedScene:
     means = frame.unit * scene.means.astype(np.float64) + frame.middle
     scales = {"scales": lambda rows: rows + np.log(frame.unit)}
     return scene.changed(scales, means=means.astype(np.float32), origin=frame.origin)
+
+
+def cropped(scene: CompressedScene, low: Float64s, high: Float64s) -> CompressedScene:
+    """The splats whose centres are in a box, its sides included; codebooks stay as they are.
+
+    Args:
+        scene: The scene.
+        low: Smallest world coordinates ``[3]``.
+        high: Largest ``[3]``.
+    """
+    positions = scene.means + np.array(scene.origin)
+    return scene.take(((positions >= low) & (positions <= high)).all(1))

@@ -39,12 +39,8 @@ def some_cameras(scene: Scene) -> dict[str, Camera]:
     return dict(spread(list(zip(scene.names, scene.cameras, strict=True)), MAX_CAMERAS))
 
 
-# RGB of the backgrounds that have names.
-BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-
-
 def write_viewer(
-    path: StrPath, scene_file: StrPath, cameras: Mapping[str, Camera], title: str, background: Color = (0.0, 0.0, 0.0)
+    path: StrPath, scene_file: StrPath, cameras: Mapping[str, Camera], title: str, background: Color | None = None
 ) -> int:
     """Write a page that holds a ``.nsvq`` file, its reader, a renderer and cameras; it loads nothing from elsewhere.
 
@@ -56,7 +52,7 @@ def write_viewer(
         cameras: At least one, by name; the page starts at the :func:`best_view`. They have the coordinates of the
             file's positions.
         title: Name of the scene, plain text.
-        background: RGB in [0, 1] behind the splats.
+        background: RGB in [0, 1] behind the splats; that of the scene by default.
 
     Returns:
         Bytes of the page.
@@ -74,7 +70,7 @@ def viewer_page(
     scene_file: StrPath,
     cameras: Mapping[str, Camera],
     title: str,
-    background: Color = (0.0, 0.0, 0.0),
+    background: Color | None = None,
     live: float | None = None,
 ) -> str:
     """The page of :func:`write_viewer`; arguments and errors are the same.
@@ -89,14 +85,17 @@ def viewer_page(
     """
     if not cameras:
         raise ValueError("a page needs at least one camera to start from, got none")
-    if len(background) != 3 or not all(0 <= value <= 1 for value in background):
-        raise ValueError(f"background must be three numbers from 0 to 1, got {list(background)}")
     about = ""
     start = 0
+    own: Color = (0.0, 0.0, 0.0)
     if live is None or Path(scene_file).is_file():
         stored = read_nsvq(scene_file)
+        own = stored.background
         about = f"{len(stored):,} splats, {(stored.stored_bytes or 0) / 1e6:.2f} MB. "
         start = best_view(stored.tensors(), list(cameras.values()))
+    behind = own if background is None else background
+    if len(behind) != 3 or not all(0 <= value <= 1 for value in behind):
+        raise ValueError(f"background must be three numbers from 0 to 1, got {list(behind)}")
     if live is None:
         file = base64.b64encode(Path(scene_file).read_bytes()).decode()
         source = f'<script id="file" type="text/plain">{file}</script>'
@@ -106,7 +105,7 @@ def viewer_page(
         connect = " connect-src 'self';"
     scene = {
         "cameras": [{"name": name, **camera_entry(camera)} for name, camera in cameras.items()],
-        "background": list(background),
+        "background": list(behind),
         "up": up_of(list(cameras.values())).tolist(),
         "near": min(camera.near for camera in cameras.values()),
         "start": start,

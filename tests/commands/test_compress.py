@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
 import pytest
-from splat_scenes import ball
+import torch
+from splat_scenes import ball, random_splats
+from transforms_scenes import write_blender
 
+from nsvq_lightning import compress, render
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import CompressedScene, read_header, read_nsvq, write_ply
 from nsvq_lightning.io.formats import read_scene, save
+from nsvq_lightning.report.pictures import write_png
 from nsvq_lightning.splats.splats import Splats, detached
 
 
@@ -142,3 +147,37 @@ def test_wrong_options_end_with_status_2(
         main(["compress", *arguments])
     assert stop.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_what_was_trained_on_white_is_compressed_and_shown_on_white(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As scenes of NeRF-synthetic are, whose photos are transparent around the object."""
+    root = write_blender(demo_scene, tmp_path / "lego")
+    photos = load_scene(root)
+    splats = random_splats(400)
+
+    def decibels(before: str, after: str) -> float:
+        found = re.search(rf"{before}([\d.]+|inf) dB {after}", capsys.readouterr().out)
+        assert found is not None
+        return float(found[1])
+
+    for index, source in enumerate(photos.images.sources):
+        image = render(splats, photos.cameras[index], background=torch.ones(3)).image
+        write_png(source.path, image)
+    plain, small, page = (tmp_path / name for name in ("scene.ply", "small.nsvq", "page.html"))
+    save(splats, plain)
+    there = ["--data.root", str(root)]
+    assert main(["compress", str(plain), str(small), "--codebooks", "0.5k", "--steps", "8", *there]) == 0
+    assert read_header(small).config["background"] == "white"
+    assert decibels(r"\(", "against the original") > 20
+    assert main(["convert", str(plain), str(tmp_path / "x.ply"), "--floaters", *there]) == 0
+    assert decibels("test photos at ", "before") > 40
+    for scene, options in ((small, []), (plain, there)):
+        assert main(["view", str(scene), "-o", str(page), *options]) == 0
+        assert '"background":[1.0,1.0,1.0]' in page.read_text(encoding="utf-8")
+    pictures = [render(splats, camera, background=torch.ones(3)).image.detach() for camera in photos.cameras]
+    again = compress(read_scene(plain), photos.cameras, pictures, codebooks="0.5k", steps=8, background="white")
+    assert again.background == (1.0, 1.0, 1.0)
+    assert main(["split", str(root), str(tmp_path / "parts"), "--blocks", "1"]) == 0
+    assert "--model.background=white" in capsys.readouterr().out

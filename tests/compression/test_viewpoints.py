@@ -88,7 +88,7 @@ def test_an_error_is_the_root_mean_square_difference_of_pictures() -> None:
     pairs = [[render(splats, camera).image.clamp(0, 1) for splats in (painting(), other)] for camera in cameras]
     expected = np.sqrt(np.mean([float((a - b).square().mean()) for a, b in pairs]))
     assert measure.error(other) == pytest.approx(expected, rel=1e-5)
-    with pytest.raises(ValueError, match="all 1 pictures of the scene are black"):
+    with pytest.raises(ValueError, match="all 1 pictures of the scene are empty"):
         Measure(painting()._replace(means=painting().means + 1e4), cameras[:1])
 
 

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from viewer_scenes import plain_scene
 
 from nsvq_lightning.io.compressed import CompressedScene, attribute_errors
+from nsvq_lightning.io.placing import cropped
 
 
 def test_a_crop_keeps_codebooks_and_what_is_inside() -> None:
     scene = coded(300, origin=(10.0, 0.0, 0.0))
     world = scene.means + np.array(scene.origin)
     low, high = np.array([9.5, -1.0, -0.5]), np.array([10.5, 1.0, np.inf])
-    part = scene.cropped(low, high)
+    part = cropped(scene, low, high)
     inside = ((world >= low) & (world <= high)).all(1)
     assert 0 < len(part) == inside.sum() < 300
     small = part.in_use()
