@@ -152,7 +152,7 @@ class PhaseSchedule(SplatCallback):
             )
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
-        """Check that a resumed run continues in the phase it was in.
+        """Check that a run continues in the phase that the module is in.
 
         Raises:
             ValueError: In this schedule, the last trained iteration is in another phase.
@@ -168,11 +168,15 @@ class PhaseSchedule(SplatCallback):
                 "ckpt_path to continue"
             )
         raise ValueError(
-            f"the checkpoint is at iteration {step} in its {module.phase.name.lower()} phase, but in a run of "
-            f"{module.schedule.total} iterations that is in the {expected.name.lower()} phase; pass "
-            "the trainer.max_steps it was started with, or that number as PhaseSchedule.total "
-            "(--callbacks.phases.total) and a larger trainer.max_steps to continue its last phase"
+            f"the module is in its {module.phase.name.lower()} phase, but iteration {step} of a run of "
+            f"{module.schedule.total} iterations is in the {expected.name.lower()} phase. A new module needs a new "
+            "trainer. To continue a checkpoint, pass the trainer.max_steps it was started with, or that number as "
+            "PhaseSchedule.total (--callbacks.phases.total) and a larger trainer.max_steps to continue its last phase"
         )
+
+    def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
+        """Check that, too, where no iteration was left to train, before files are written."""
+        self.on_train_start(trainer, module)
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Write the phase of the iteration that starts; end the run earlier by what its warm-up has saved."""

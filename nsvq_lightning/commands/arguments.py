@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from nsvq_lightning.commands import nearest
 from nsvq_lightning.commands.settings import settings_of, values_by_name
@@ -24,7 +24,11 @@ log = logging.getLogger(__name__)
 
 
 class Parser(argparse.ArgumentParser):
-    """:class:`argparse.ArgumentParser` that names the option that a misspelt one resembles."""
+    """:class:`argparse.ArgumentParser` that names the option that a misspelt one resembles, and reads ``-1e-9``."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._negative_number_matcher = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?$|-inf$", re.IGNORECASE)
 
     def error(self, message: str) -> NoReturn:
         """Write usage and message to stderr and exit with status 2."""
@@ -184,7 +188,9 @@ def _found_views(path: Path, root: Path | None) -> "tuple[dict[str, Camera], Sce
     return {}, None
 
 
-def cameras_of(path: Path, root: Path | None, means: "Float32s | None" = None) -> "dict[str, Camera]":
+def known_views(
+    path: Path, root: Path | None, means: "Float32s | None" = None
+) -> "tuple[dict[str, Camera], Scene | None]":
     """Cameras by name of the photos that a scene was trained on, or that its run or trainer has left beside it.
 
     They are looked for as ``viewer.html`` in the folder of a run, as ``cameras.json`` of INRIA's trainer, as a COLMAP
@@ -195,15 +201,13 @@ def cameras_of(path: Path, root: Path | None, means: "Float32s | None" = None) -
         root: Folder whose cameras they are instead; it needs no photos.
         means: Positions of the scene ``[N, 3]``: cameras that do not show it are not its own, which is a warning.
 
+    Returns:
+        The cameras, and the photos, if there are any.
+
     Raises:
         SceneError: The folder is not a scene.
         ValueError: What the run has recorded is damaged.
     """
-    return known_views(path, root, means)[0]
-
-
-def known_views(path: Path, root: Path | None, means: "Float32s | None") -> "tuple[dict[str, Camera], Scene | None]":
-    """What :func:`_found_views` has found, if it shows the scene."""
     from nsvq_lightning.compression.viewpoints import check_cameras
 
     cameras, photos = _found_views(path, root)
@@ -218,7 +222,7 @@ def known_views(path: Path, root: Path | None, means: "Float32s | None") -> "tup
 
 
 def trained_scene(path: Path, root: Path | None) -> "CompressedScene":
-    """A scene with the cameras of its training, where these are known: its own, or those of :func:`cameras_of`.
+    """A scene with the cameras of its training, where these are known: its own, or those of :func:`known_views`.
 
     What is damaged beside it is no use, which is a warning.
 

@@ -126,9 +126,9 @@ def _write_levels(options: argparse.Namespace, compressor: "Compressor", most: i
     from nsvq_lightning.io.formats import save
 
     scene = compressor.scene
-    levels = [scene if most == len(scene) else compressor.at(Setting(most, "none")).scene]
-    for level in range(1, options.levels or LOD_LEVELS):
-        levels.append(compressor.at(Setting(max(1, most // 4**level), "none")).scene)
+    # Where there are few, the last levels would be alike.
+    wanted = dict.fromkeys(max(1, most // 4**level) for level in range(options.levels or LOD_LEVELS))
+    levels = [scene if count == len(scene) else compressor.at(Setting(count, "none")).scene for count in wanted]
     size = save(levels[0], options.output, coarser=levels[1:])
     counts = ", ".join(f"{len(level):,}" for level in levels)
     say(f"{options.output}: levels of {counts} splats, {size:,} bytes")

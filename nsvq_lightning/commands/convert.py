@@ -20,7 +20,7 @@ import numpy as np
 from tqdm import tqdm
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import add_root, cameras_of, trained_scene, views_of
+from nsvq_lightning.commands.arguments import add_root, known_views, trained_scene, views_of
 from nsvq_lightning.commands.compress import share_or_number, splats_left, written_error
 from nsvq_lightning.io import formats, lod, placing, spz
 from nsvq_lightning.io.compressed import CompressedScene, attribute_errors, on_white, renderer
@@ -156,7 +156,7 @@ def _up(options: argparse.Namespace) -> Float64s:
     if options.up_from is None:
         from nsvq_lightning.rendering.poses import up_of
 
-        return up_of(list(cameras_of(options.inputs[0], options.root).values()))
+        return up_of(list(known_views(options.inputs[0], options.root)[0].values()))
     up = np.array(options.up_from)
     length = float(np.linalg.norm(up))
     if not 0 < length < np.inf:

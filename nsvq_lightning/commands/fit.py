@@ -216,8 +216,6 @@ class SplatCLI(LightningCLI):
         parser.callback_keys = [key for key in keys if not isinstance(self._get(self.config_init, key), unwanted)]
         if settings.logger in (None, True):
             kwargs["logger"] = False  # until the run has a folder: see RunStart
-        if self.subcommand == "validate" and settings.limit_val_batches == 0:
-            kwargs["limit_val_batches"] = 1.0  # 0 comes from a config that `fit` has written
         return super().instantiate_trainer(**kwargs)
 
     def _run_subcommand(self, subcommand: str) -> None:

@@ -44,6 +44,7 @@ def run(options: argparse.Namespace) -> int:
     if options.output.exists():
         raise FileExistsError(f"{options.output} exists: remove it, or give another folder")
     scene = load_scene(options.scene, cache_bytes=0)
+    behind = ["--model.background=white"] if scene.white else []  # what the photos of parts are in front of
     blocks = cut(scene, options.blocks)
     folders = [options.output / str(number) for number in range(1, len(blocks) + 1)]
     for folder in folders:
@@ -51,9 +52,6 @@ def run(options: argparse.Namespace) -> int:
     for folder, (train, test) in zip(folders, write_blocks(scene, blocks, folders), strict=True):
         sys.stderr.write(f"{folder}: {train} train and {test} test photos\n")
         root = folder.resolve()
-        fit = ["nsvq", "fit", f"--data.root={root}", f"--trainer.run_folder={root / RUN}"]
-        if scene.white:  # which the photos of parts are in front of
-            fit.append("--model.background=white")
-        fit += options.further
+        fit = ["nsvq", "fit", f"--data.root={root}", f"--trainer.run_folder={root / RUN}", *behind, *options.further]
         say(shlex.join(fit))
     return 0

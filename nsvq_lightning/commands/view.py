@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import add_root, cameras_of, scene_file, trained_scene
+from nsvq_lightning.commands.arguments import add_root, known_views, scene_file, trained_scene
 from nsvq_lightning.io.atomic import make_folder_of
 
 if TYPE_CHECKING:
@@ -59,6 +59,8 @@ def run(options: argparse.Namespace) -> int:
 
     if options.live and (options.output is not None or not options.scene.is_dir()):
         raise argparse.ArgumentError(None, "--live follows a running fit: give the folder of the run, and no --output")
+    if options.output is not None and options.output.suffix.lower() not in (".html", ".htm"):
+        raise argparse.ArgumentError(None, f"{options.output}: a page is named .html; nsvq convert writes scene files")
     path = options.scene.resolve()
     title = f"{path.parent.name} / {path.name}" if path.is_dir() else path.name
     with _nsvq_file(options) as file:
@@ -115,7 +117,8 @@ def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     # What a run has recorded are its own, and need no look at the scene.
     is_own = options.root is None and (options.scene / "viewer.html").is_file()
     splats = None if options.live or is_own else load(file)
-    cameras = cameras_of(options.scene, options.root, None if splats is None else splats.means.detach().numpy())
+    means = None if splats is None else splats.means.detach().numpy()
+    cameras, _ = known_views(options.scene, options.root, means)
     if cameras:
         return dict(spread(list(cameras.items()), MAX_CAMERAS))
     if options.live:

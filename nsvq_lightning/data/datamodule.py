@@ -162,11 +162,16 @@ class SceneDataModule(LightningDataModule):
 
     @property
     def draw(self) -> int:
-        """Number of train views that each process had drawn when the trainer's current state was reached."""
+        """Number of train views that each process had drawn when the trainer's current state was reached.
+
+        Those that ``overfit_batches`` repeats count once.
+        """
         if self.trainer is None:
             return 0
         total = self.trainer.fit_loop.epoch_loop.batch_progress.total
-        return int(total.processed)  # type: ignore[attr-defined]  # Lightning types the base of its counters
+        drawn = int(total.processed)  # type: ignore[attr-defined]  # Lightning types the base of its counters
+        repeated = int(self.trainer.overfit_batches)  # type: ignore[attr-defined]
+        return drawn % repeated if repeated else drawn
 
     def _ordered(self, indices: Sequence[int]) -> DataLoader[View]:
         rank, world_size = self.process

@@ -158,8 +158,7 @@ def _neighbours(photos: list[_Photo]) -> list[tuple[_Photo, _Photo]]:
         least, largest = (share * photo.depth for share in BASELINE)
         usable = (base > least) & (base < largest) & (angle < MAX_TURNED)
         nearest = np.argsort(np.where(usable, base + 0.01 * photo.depth * angle, np.inf), kind="stable")
-        for j in nearest[: min(MAX_NEIGHBOURS, usable.sum())].tolist():
-            pairs.add((min(i, j), max(i, j)))
+        pairs |= {(min(i, j), max(i, j)) for j in nearest[: min(MAX_NEIGHBOURS, usable.sum())].tolist()}
     return [(photos[i], photos[j]) for i, j in sorted(pairs)]
 
 

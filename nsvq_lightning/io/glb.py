@@ -212,9 +212,8 @@ def _splats(document: Json, data: memoryview, primitive: Json) -> CompressedScen
     }
     # In drafts, colours and opacities were those of the points.
     shown = values(OPACITY if OPACITY in names else "COLOR_0")
-    if shown.shape[1] == 3:  # colours without alpha, which is 1
-        shown = np.ones_like(shown)
-    rows["opacities"] = logits_of(shown[:, -1])
+    # Without alpha, colours are opaque.
+    rows["opacities"] = logits_of(np.ones(len(shown)) if shown.shape[1] == 3 else shown[:, -1])
     if _harmonic(0) in names:
         rows["sh0"] = values(_harmonic(0))
     else:

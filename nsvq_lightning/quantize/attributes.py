@@ -38,7 +38,12 @@ def build_quantizers(
         if sizes[name] < 1:
             raise ValueError(f"codebooks: {name} needs at least 1 code, got {sizes[name]}")
         built[name] = module = quantizer(sizes[name], dim)
-        as_quantizer(module)
+        codebook = as_quantizer(module).codebook
+        if codebook.dtype != torch.float32 or codebook.shape[1:] != (dim,):
+            found = f"{list(codebook.shape)} {codebook.dtype}"
+            raise TypeError(
+                f"{type(module).__name__}: the codebook of {name} must be [K, {dim}] float32, it is {found}"
+            )
     return built
 
 

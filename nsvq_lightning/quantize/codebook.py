@@ -395,6 +395,10 @@ def as_quantizer(module: object) -> Quantizer:
             f"{type(module).__name__} is not a quantizer: it must be an nn.Module whose codebook is an nn.Parameter, "
             "so that checkpoints carry it and the optimiser trains it"
         )
+    others = [name for name, each in module.named_parameters() if each.requires_grad and each is not quantizer.codebook]
+    if others:
+        what = f"has parameters beside its codebook, {', '.join(others)}"
+        raise TypeError(f"{type(module).__name__} {what}, which are neither trained nor stored: make them buffers")
     return quantizer
 
 

@@ -51,8 +51,7 @@ class Camera:
         # Kept as Python floats: reading them from an accelerator would stall it at every render.
         intrinsics = fx, fy, cx, cy
         vars(self).update(intrinsics=intrinsics, packed_view=_packed(self.viewmat))
-        sides = fx / self.width, fy / self.height
-        if not (all(map(math.isfinite, intrinsics)) and min(sides) > MIN_FOCAL):
+        if not (all(map(math.isfinite, intrinsics)) and min(fx / self.width, fy / self.height) > MIN_FOCAL):
             raise ValueError(f"Camera.K needs positive, finite focal lengths and a centre, in pixels, got {intrinsics}")
         if not 0 < self.near < math.inf:
             raise ValueError(f"Camera.near must be positive and finite, got {self.near}")

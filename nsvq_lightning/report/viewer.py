@@ -87,13 +87,12 @@ def viewer_page(
         raise ValueError("a page needs at least one camera to start from, got none")
     about = ""
     start = 0
-    own: Color = (0.0, 0.0, 0.0)
+    behind = (0.0, 0.0, 0.0) if background is None else background
     if live is None or Path(scene_file).is_file():
         stored = read_nsvq(scene_file)
-        own = stored.background
+        behind = stored.background if background is None else background
         about = f"{len(stored):,} splats, {(stored.stored_bytes or 0) / 1e6:.2f} MB. "
         start = best_view(stored.tensors(), list(cameras.values()))
-    behind = own if background is None else background
     if len(behind) != 3 or not all(0 <= value <= 1 for value in behind):
         raise ValueError(f"background must be three numbers from 0 to 1, got {list(behind)}")
     if live is None:

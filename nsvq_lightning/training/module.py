@@ -11,6 +11,7 @@ from typing import Any, Literal, Self, cast
 import numpy as np
 import torch
 from lightning.pytorch import LightningModule
+from lightning.pytorch.callbacks import StochasticWeightAveraging, WeightAveraging
 from lightning.pytorch.utilities.model_helpers import _restricted_classmethod
 from torch import Tensor, nn
 
@@ -241,6 +242,9 @@ class SplatModule(LightningModule):
                 f"splats train in float32, trainer.precision is {self.trainer.precision}: kernels compute in float32 "
                 "whatever it says, and a scaled loss would grow splats needlessly; leave it at 32-true"
             )
+        for callback in self.trainer.callbacks:  # type: ignore[attr-defined]  # Lightning does not type it
+            if isinstance(callback, StochasticWeightAveraging | WeightAveraging):
+                raise ValueError(f"{type(callback).__name__} averages parameters, but splats come and go: leave it out")
         self.evaluation_splats = None  # an interrupted evaluation may have left some
         scene = run_scene.scene_of(self.trainer)
         if scene is not None:

@@ -116,13 +116,25 @@ def to_compressed(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> Com
     Args:
         splats: Raw attributes.
         quantizers: Quantizer by attribute; empty stores everything as it is.
+
+    Raises:
+        ValueError: A codebook was never placed, or decodes to something else than its rows.
     """
     # Check before quantizing: the code of a row with NaN would be finite.
     finite, culprits = finite_rows(splats._asdict())
+    codes = {name: codes_of(splats, name, quantizer) for name, quantizer in quantizers.items()}
+    for name, quantizer in quantizers.items():
+        some = codes[name][:1000]
+        if not getattr(quantizer, "fitted", True):
+            raise ValueError(f"the codebook of {name} has never been placed: add CodebookInit to the callbacks")
+        if not torch.equal(quantizer.decode(some), quantizer.codebook[some]):
+            raise ValueError(
+                f"{type(quantizer).__name__} of {name} decodes to other rows than its codebook's, in files"
+            )
     scene = CompressedScene(
         means=_numpy(splats.means),
         opacities=_numpy(splats.opacities),
-        codes={name: _numpy(codes_of(splats, name, quantizer)) for name, quantizer in quantizers.items()},
+        codes={name: _numpy(found) for name, found in codes.items()},
         codebooks={name: _numpy(quantizer.codebook) for name, quantizer in quantizers.items()},
         raw={name: _numpy(attribute_rows(splats, name)) for name in QUANTIZABLE if name not in quantizers},
         sh_degree=sh_degree_of(splats.shN),

@@ -61,6 +61,11 @@ class SplatTrainer(Trainer):
         if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # Lightning's own
             self.strategy.checkpoint_io = PlainCheckpointIO()
 
+    def validate(self, *args: Any, **kwargs: Any) -> Any:
+        """Lightning's, of all test views where :data:`TRAINER_DEFAULTS` have left none."""
+        self.limit_val_batches = self.limit_val_batches or 1.0
+        return super().validate(*args, **kwargs)
+
     def export(self, model: SplatModule, ckpt_path: str, output: str = "scene.nsvq", datamodule: Any = None) -> Path:
         """Write the scene of a checkpoint as a file.
 

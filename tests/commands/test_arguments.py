@@ -13,7 +13,6 @@ from splat_scenes import random_splats
 
 from nsvq_lightning.commands.arguments import (
     Parser,
-    cameras_of,
     integers,
     known_views,
     names,
@@ -102,7 +101,7 @@ def test_cameras_of_inrias_trainer_lie_up_to_two_folders_above_the_scene(tmp_pat
     scene = tmp_path / "run" / "point_cloud" / "iteration_30000" / "point_cloud.ply"
     scene.parent.mkdir(parents=True)
     (scene.parents[above] / "cameras.json").write_text(json.dumps([ENTRY]))
-    assert list(cameras_of(scene, None)) == ["a"] * (above < 3)
+    assert list(known_views(scene, None)[0]) == ["a"] * (above < 3)
     if above < 3:
         views = views_of(scene, random_splats(9), 5, None)
         assert [(view.width, view.height) for view in views] == [(8, 6)]
@@ -137,15 +136,15 @@ def test_photos_of_a_run_have_the_size_that_it_trained(
     tmp_path: Path, demo_scene: Path, settings: str, width: int
 ) -> None:
     (tmp_path / "config.yaml").write_text(f"data: {{init_args: {{root: {demo_scene}, {settings}}}}}")
-    assert {camera.width for camera in cameras_of(tmp_path, None).values()} == {width}
+    assert {camera.width for camera in known_views(tmp_path, None)[0].values()} == {width}
 
 
 def test_no_cameras_are_found_where_there_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert cameras_of(Path("scene.ply"), None) == {}
+    assert known_views(Path("scene.ply"), None)[0] == {}
     Path("cameras.json").write_text("[{}]")
     with pytest.raises(ValueError, match=r"cameras\.json is no list of cameras as INRIA's trainer writes it"):
-        cameras_of(Path("scene.ply"), None)
+        known_views(Path("scene.ply"), None)[0]
 
 
 def _without_photos(scene: Path, folder: Path) -> Path:
@@ -161,8 +160,8 @@ def test_cameras_need_no_photos(tmp_path: Path, demo_scene: Path) -> None:
     root = _without_photos(demo_scene, tmp_path / "scene")
     path = tmp_path / "a" / "b" / "c.ply"
     path.parent.mkdir(parents=True)
-    assert cameras_of(path, None) == {}
-    for found in (cameras_of(path, root), load_cameras(root)):
+    assert known_views(path, None)[0] == {}
+    for found in (known_views(path, root)[0], load_cameras(root)):
         assert tuple(found) == expected.names
         assert all(
             torch.equal(one.viewmat, other.viewmat) for one, other in zip(found.values(), expected.cameras, strict=True)
@@ -171,7 +170,7 @@ def test_cameras_need_no_photos(tmp_path: Path, demo_scene: Path) -> None:
     assert len(views_of(path, splats, 4, root)) == 3
     assert known_views(path, root, splats.means.numpy())[1] is None
     _without_photos(demo_scene, tmp_path / "a")  # beside the scene, a folder above
-    assert tuple(cameras_of(path, None)) == expected.names
+    assert tuple(known_views(path, None)[0]) == expected.names
 
 
 def test_cameras_of_another_scene_are_not_used(
@@ -185,7 +184,7 @@ def test_cameras_of_another_scene_are_not_used(
     for splats, count in ((own, 9), (moved, 0)):
         save(splats, path)
         assert len(trained_scene(path, None).cameras) == count
-        assert len(cameras_of(path, None, splats.means.numpy())) == count
+        assert len(known_views(path, None, splats.means.numpy())[0]) == count
     assert "scene.ply: the cameras of the folders beside it are not used: 9 cameras show " in caplog.text
     for wrong in (root, demo_scene):
         assert known_views(path, wrong, moved.means.numpy()) == ({}, None)
@@ -194,4 +193,11 @@ def test_cameras_of_another_scene_are_not_used(
 
 def test_the_folder_of_a_trainer_may_be_named(tmp_path: Path) -> None:
     (tmp_path / "cameras.json").write_text(json.dumps([ENTRY]))
-    assert list(cameras_of(Path("elsewhere/scene.ply"), tmp_path)) == ["a"]
+    assert list(known_views(Path("elsewhere/scene.ply"), tmp_path)[0]) == ["a"]
+
+
+@pytest.mark.parametrize("number", ["-1", "-.5", "-1.", "-2.2e-16", "-1E+3", "-inf"])
+def test_negative_numbers_are_no_options(number: str) -> None:
+    parser = Parser()
+    parser.add_argument("--up-from", nargs=3, type=float)
+    assert parser.parse_args(["--up-from", "0", number, "1"]).up_from == [0.0, float(number), 1.0]

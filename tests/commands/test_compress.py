@@ -149,6 +149,13 @@ def test_wrong_options_end_with_status_2(
     assert message in capsys.readouterr().err
 
 
+def test_levels_end_where_they_would_be_alike(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_ply(tmp_path / "scene.ply", ball(20, degree=0))
+    paths = str(tmp_path / "scene.ply"), str(tmp_path / "lod" / "lod-meta.json")
+    assert main(["compress", *paths, "--levels=8", "--steps=4"]) == 0
+    assert "levels of 20, 5, 1 splats" in capsys.readouterr().out
+
+
 def test_what_was_trained_on_white_is_compressed_and_shown_on_white(
     demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

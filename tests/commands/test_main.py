@@ -315,3 +315,25 @@ def test_no_command_goes_on_with_an_empty_scene(
     error = f"nsvq {command.split()[0]}: x.ply: no finite splat among {count}{reason}; give a scene with splats\n"
     assert capsys.readouterr().err.endswith(error)
     assert [path.name for path in tmp_path.iterdir()] == ["x.ply"]
+
+
+def test_a_closed_output_ends_no_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As daemons and pythonw have it."""
+    write_ply(tmp_path / "scene.ply", plain_scene(5, 0))
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, None)
+    assert main(["info", str(tmp_path / "scene.ply")]) == 0
+    assert (
+        main(
+            [
+                "convert",
+                str(tmp_path / "scene.ply"),
+                str(tmp_path / "x.nsvq"),
+                "--crop",
+                *map(str, [-1e-9] * 3 + [1e-9] * 3),
+            ]
+        )
+        == 1
+    )
+    for stream in (sys.stdout, sys.stderr):
+        stream.close()

@@ -204,3 +204,12 @@ def test_a_port_in_use_is_told(
     assert main(arguments) == 1
     assert f"cannot listen on 127.0.0.1:{port}" in capsys.readouterr().err
     assert len(read_nsvq(tmp_path / "scene.nsvq")) == 3
+
+
+def test_a_page_takes_the_place_of_no_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save(random_splats(9), tmp_path / "scene.ply")
+    before = (tmp_path / "scene.ply").read_bytes()
+    with pytest.raises(SystemExit):
+        main(["view", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "scene.ply")])
+    assert "scene.ply: a page is named .html; nsvq convert writes scene files" in capsys.readouterr().err
+    assert (tmp_path / "scene.ply").read_bytes() == before

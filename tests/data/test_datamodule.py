@@ -46,11 +46,11 @@ class _Recorder(LightningModule):
         return torch.optim.SGD(self.parameters(), 0.1)
 
 
-def _on(data: ColmapDataModule, step: int, rank: int, world_size: int) -> ColmapDataModule:
-    """The data module as it is on one of several processes."""
+def _on(data: ColmapDataModule, step: int, rank: int, world_size: int, repeated: int = 0) -> ColmapDataModule:
+    """The data module as it is on one of several processes, with so many batches that are repeated."""
     progress = SimpleNamespace(total=SimpleNamespace(processed=step))
     loop = SimpleNamespace(epoch_loop=SimpleNamespace(batch_progress=progress))
-    trainer = SimpleNamespace(fit_loop=loop, global_rank=rank, world_size=world_size)
+    trainer = SimpleNamespace(fit_loop=loop, global_rank=rank, world_size=world_size, overfit_batches=repeated)
     data.trainer = cast(Trainer, trainer)
     return data
 
@@ -93,6 +93,14 @@ def test_processes_share_the_train_sequence_and_the_test_views(make_scene: Scene
     assert [name for pair in zip(*draws, strict=True) for name in pair] == whole
     shares = [[view.index for view in _on(ColmapDataModule(root), 0, r, 3).val_dataloader()] for r in range(3)]
     assert shares == [[0, 24], [8], [16]]  # nothing padded
+
+
+def test_overfitting_repeats_the_first_views(make_scene: SceneFactory) -> None:
+    root = str(make_scene(views=30))
+    first = [view.name for view in islice(ColmapDataModule(root).train_dataloader(), 2)]
+    for step in (0, 2, 8):
+        data = _on(ColmapDataModule(root), step, 0, 1, repeated=2)
+        assert [view.name for view in islice(data.train_dataloader(), 2)] == first
 
 
 def test_more_processes_than_test_views(make_scene: SceneFactory) -> None:

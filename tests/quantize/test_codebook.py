@@ -286,3 +286,13 @@ def test_a_codebook_that_nothing_trains_is_refused() -> None:
     quantizer.register_buffer("codebook", torch.zeros(4, 3))
     with pytest.raises(TypeError, match=r"codebook is an nn\.Parameter"):
         as_quantizer(quantizer)
+
+
+def test_parameters_beside_the_codebook_are_refused_and_buffers_are_not() -> None:
+    quantizer = NSVQ(4, 3)
+    quantizer.register_buffer("gain", torch.ones(()))
+    quantizer.register_parameter("fixed", nn.Parameter(torch.ones(()), requires_grad=False))
+    assert as_quantizer(quantizer) is quantizer
+    quantizer.register_parameter("offset", nn.Parameter(torch.zeros(3)))
+    with pytest.raises(TypeError, match=r"NSVQ has parameters beside its codebook, offset, .*: make them buffers"):
+        as_quantizer(quantizer)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import photometric_loss
+from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render, visible
@@ -185,6 +186,21 @@ def test_what_is_not_a_quantizer_is_refused() -> None:
         SplatModule(codebooks={"scales": 0})
     with pytest.raises(ValueError, match="background must be"):
         SplatModule(background="green")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"dtype": torch.float64}, r"the codebook of scales must be \[K, 3\] float32, it is \[4, 3\] torch\.float64"),
+        ({"dim": 5}, r"the codebook of scales must be \[K, 3\] float32, it is \[4, 5\] torch\.float32"),
+    ],
+)
+def test_a_codebook_of_another_kind_is_refused_before_training(change: dict[str, Any], words: str) -> None:
+    def make(codes: int, dim: int) -> nn.Module:
+        return NSVQ(codes, change.get("dim", dim)).to(change.get("dtype", torch.float32))
+
+    with pytest.raises(TypeError, match=f"NSVQ: {words}"):
+        SplatModule(quantizer=make, codebooks={"scales": 4})
 
 
 def test_a_trained_module_cannot_be_trained_from_the_start(module: SplatModule) -> None:

@@ -47,7 +47,11 @@ def test_every_run_gets_the_next_version_whatever_the_logger(
     found = []
     for version in range(2):
         trainer, _ = run(
-            callbacks(), max_steps=3, default_root_dir=tmp_path / "runs", logger=logger, module={"seed": version}
+            callbacks(),
+            max_steps=3,
+            default_root_dir=tmp_path / "runs",
+            logger=logger,
+            module={"seed": version, "codebooks": None},
         )
         folder = run_folder(trainer)
         assert folder == tmp_path / "runs" / demo_scene.name / f"version_{version}"
@@ -61,7 +65,8 @@ def test_every_run_gets_the_next_version_whatever_the_logger(
 def test_a_folder_that_holds_a_run_is_refused(run: RunFactory, tmp_path: Path) -> None:
     def fit(**more: Any) -> Trainer:
         logger = CSVLogger(tmp_path, name="a", version="b", flush_logs_every_n_steps=1)
-        return run(callbacks(), logger=logger, log_every_n_steps=1, **({"max_steps": 4} | more))[0]
+        options: dict[str, Any] = {"logger": logger, "log_every_n_steps": 1, "max_steps": 4} | more
+        return run(callbacks(), module={"codebooks": None}, **options)[0]
 
     folder = run_folder(fit())
     assert folder == tmp_path / "a" / "b"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from splat_scenes import front_camera, random_splats
+from torch import Tensor
 
 from nsvq_lightning.quantize import NSVQ, PostHoc, Quantizer
 from nsvq_lightning.random import generator
@@ -87,6 +88,21 @@ def test_before_the_codebooks_everything_is_stored_as_it_is(caplog: pytest.LogCa
     assert "the prune phase has no codebooks yet: the scene is stored unquantized" in caplog.text
     assert not stored.codes
     assert stored.config["codebooks"] == {}
+
+
+class Tenth(NSVQ):
+    """Decodes to something else than its codebook, which is all that files hold."""
+
+    def decode(self, codes: Tensor) -> Tensor:
+        return super().decode(codes) / 10
+
+
+def test_codebooks_that_files_cannot_hold_are_refused() -> None:
+    scene = replace(scene_of_splats(), quantizers={"scales": NSVQ(6, 3)})
+    with pytest.raises(ValueError, match="the codebook of scales has never been placed: add CodebookInit"):
+        scene.compressed(Phase.QUANTIZE, {})
+    with pytest.raises(ValueError, match="Tenth of sh0 decodes to other rows than its codebook's"):
+        with_codebooks(scene_of_splats(), Tenth, sh0=4).compressed(Phase.QUANTIZE, {})
 
 
 def test_the_sizes_of_codebooks_that_storing_places_are_those_that_it_placed() -> None:

@@ -11,12 +11,16 @@ from typing import Any
 
 import pytest
 import torch
-from lightning.pytorch import Trainer
+from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.accelerators import CUDAAccelerator, MPSAccelerator
+from lightning.pytorch.callbacks import StochasticWeightAveraging, WeightAveraging
 from lightning.pytorch.trainer.connectors import accelerator_connector
+from splat_scenes import random_splats
 
+from nsvq_lightning.callbacks import ExportScene, PhaseSchedule
 from nsvq_lightning.compute import devices
 from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training import trainer
 from nsvq_lightning.training.distributed import ViewParallelStrategy, check_strategy
 from nsvq_lightning.training.module import SplatModule
@@ -80,3 +84,31 @@ def test_two_processes_of_a_notebook_hand_back_what_they_trained(demo_scene: Pat
     assert two.stdout.splitlines()[-1] == one.stdout.splitlines()[-1]
     refused = in_a_notebook(demo_scene, tmp_path, "rendered")
     assert "restart it and fit before anything is rendered" in refused.stderr
+
+
+def test_a_trainer_that_is_done_writes_nothing_of_a_new_module(demo_scene: Path, tmp_path: Path) -> None:
+    """As where a cell of a notebook is run again."""
+    data = ColmapDataModule(str(demo_scene), factor=2)
+    callbacks = [PhaseSchedule(), ExportScene()]
+    done = SplatTrainer(max_steps=4, callbacks=callbacks, run_folder=str(tmp_path), accelerator="cpu")
+    done.fit(SplatModule(codebooks=None), data)
+    before = (tmp_path / "scene.nsvq").read_bytes()
+    with pytest.raises(ValueError, match=r"in its warmup phase, but iteration 4 .* A new module needs a new trainer"):
+        done.fit(SplatModule(codebooks=None), data)
+    assert (tmp_path / "scene.nsvq").read_bytes() == before
+
+
+@pytest.mark.parametrize("average", [StochasticWeightAveraging(0.1), WeightAveraging()])
+def test_averages_of_parameters_that_come_and_go_are_refused(
+    demo_scene: Path, tmp_path: Path, average: Callback
+) -> None:
+    settings: dict[str, Any] = {"accelerator": "cpu", "default_root_dir": tmp_path}
+    with pytest.raises(ValueError, match="Averaging averages parameters, but splats come and go"):
+        SplatTrainer(max_steps=2, callbacks=[average], **settings).fit(SplatModule(), ColmapDataModule(str(demo_scene)))
+
+
+def test_validation_is_of_all_test_views(demo_scene: Path, tmp_path: Path) -> None:
+    module = SplatModule(splats=Splats.from_tensors(*random_splats(50)))
+    trainer = SplatTrainer(accelerator="cpu", default_root_dir=tmp_path, enable_progress_bar=False)
+    (figures,) = trainer.validate(module, datamodule=ColmapDataModule(str(demo_scene)), verbose=False)
+    assert figures["val/psnr"] > 0

@@ -210,8 +210,7 @@ def as_markdown(about: Sequence[str], scope: Scope, suites: Mapping[str, Sequenc
     for suite, rows in suites.items():
         parts.append(f"## {suite}")
         for operation in dict.fromkeys(row.operation for row in rows):
-            parts.append(f"### {operation}")
-            parts.append(_table([row for row in rows if row.operation == operation]))
+            parts += [f"### {operation}", _table([row for row in rows if row.operation == operation])]
     return "\n\n".join(parts) + "\n"
 
 
