@@ -270,5 +270,5 @@ def summary(folder: Path, metrics: Json) -> str:
         f"  {metrics['num_splats']} splats in {metrics['file_bytes']} bytes (scene.nsvq), "
         f"{metrics['ratio']:.1f} times smaller than the plain .ply\n"
         f"  {metrics['train_seconds']:.0f} s of training\n"
-        f"look at it: open {folder / 'viewer.html'}, or nsvq view {folder}\n"
+        f"look at it: open {folder / 'viewer.html'}, or {shlex.join(['nsvq', 'view', str(folder)])}\n"
     )

@@ -323,17 +323,7 @@ def test_a_closed_output_ends_no_command(tmp_path: Path, monkeypatch: pytest.Mon
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, None)
     assert main(["info", str(tmp_path / "scene.ply")]) == 0
-    assert (
-        main(
-            [
-                "convert",
-                str(tmp_path / "scene.ply"),
-                str(tmp_path / "x.nsvq"),
-                "--crop",
-                *map(str, [-1e-9] * 3 + [1e-9] * 3),
-            ]
-        )
-        == 1
-    )
+    nowhere = map(str, (-1e-9, -1e-9, -1e-9, 1e-9, 1e-9, 1e-9))
+    assert main(["convert", str(tmp_path / "scene.ply"), str(tmp_path / "x.nsvq"), "--crop", *nowhere]) == 1
     for stream in (sys.stdout, sys.stderr):
         stream.close()
