@@ -71,7 +71,7 @@ class SplatBudget(SplatCallback):
         budget, reason = self.splats or 0, "as asked"
         if self.bytes is not None:
             codebooks = {name: tuple(quantizer.codebook.shape) for name, quantizer in module.quantizers.items()}
-            stored = module.splats.sh_degree, module.storage.precision, module.rate_strength
+            stored = module.splats.sh_degree, module.storage.precision, module.rate_strength, module.values_per_splat
             budget = splats_for_bytes(self.bytes, codebooks, *stored)
             reason = f"for a file of {self.bytes} bytes"
         elif self.splats is None:
@@ -308,16 +308,17 @@ def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:
 
 
 def splats_for_bytes(
-    size: int, codebooks: Mapping[str, Sequence[int]], sh_degree: int, precision: Precision, strength: float
+    size: int, books: Mapping[str, Sequence[int]], sh_degree: int, precision: Precision, strength: float, most: float
 ) -> int:
     """Number of splats in a file of level ``compact``, within a tenth; a fifth where codes are chosen by their rate.
 
     Args:
         size: Bytes of the file.
-        codebooks: Codes and dimension of each codebook by attribute.
+        books: Codes and dimension of each codebook by attribute.
         sh_degree: Of the splats.
         precision: Largest errors of the file.
         strength: Of the choice of codes by rate and distortion; 0 without it.
+        most: Numbers of a codebook for each splat; infinite without a limit.
 
     Raises:
         ValueError: There is no room for splats beside the codebooks.
@@ -329,13 +330,12 @@ def splats_for_bytes(
     bits = 23.5 - 3 * math.log2(position) - math.log2(opacity)
     # What remains of codes and codebooks where codes are chosen by rate and distortion, as measured.
     coded = 1 / (1 + 0.25 * strength)
-    books, codes = codebook_bits(codebooks)
-    fixed, bits = fixed + coded * books, bits + coded * codes
-    bits += 32 * sum(attribute_dims(sh_degree)[name] for name in QUANTIZABLE if name not in codebooks)
-    splats = int((8 * size - fixed) / bits)
+    bits += 32 * sum(attribute_dims(sh_degree)[name] for name in QUANTIZABLE if name not in books)
+    splats = size
+    for _ in range(8):  # codebooks depend on the splats, and these on what codebooks leave
+        placed = {name: (min(count, max(1.0, most * splats / dim)), dim) for name, (count, dim) in books.items()}
+        all_books, codes = codebook_bits(placed)
+        splats = max(1, int((8 * size - fixed - coded * all_books) / (bits + coded * codes)))
     if splats < MIN_BUDGET:
-        raise ValueError(
-            f"{size} bytes leave room for {max(splats, 0)} splats beside codebooks of {round(fixed / 8)} bytes; allow "
-            "more, or take smaller codebooks (--model.codebooks=0.5k)"
-        )
+        raise ValueError(f"{size} bytes leave no room beside codebooks: allow more, or --model.codebooks=0.5k")
     return splats

@@ -1,6 +1,7 @@
 """What the quantize and fine-tune phases do to codebooks and codes: place, refit, replace, mend, freeze."""
 
 import logging
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -85,6 +86,10 @@ class CodebookInit(SplatCallback):
     """Largest K·D of a codebook for each splat; None has no limit. A value takes 4 to 5 bits in the file, so 1024 codes
     of 45 values for 36 000 splats take as much as they save."""
 
+    def tell(self, module: SplatModule) -> None:
+        """Tell how large codebooks may be."""
+        module.values_per_splat = self.values_per_splat or math.inf
+
     def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether codebooks are placed before this iteration."""
         return iteration == module.schedule.first_of(Phase.QUANTIZE)
@@ -98,8 +103,8 @@ class CodebookInit(SplatCallback):
         for name, quantizer in module.quantizers.items():
             if trainer.is_global_zero:
                 if self.values_per_splat is not None and hasattr(quantizer, "limit"):
-                    values = self.values_per_splat * len(module.splats)
-                    quantizer.limit(max(1, int(values / quantizer.codebook.shape[1])))
+                    most = self.values_per_splat * len(module.splats) / quantizer.codebook.shape[1]
+                    quantizer.limit(max(1, int(most)))
                 weight = None if name == "scales" else weights
                 draws = generator(module.seed, iteration, "kmeans", name)
                 quantizer.fit(module.scene.rows(name), weight, generator=draws)

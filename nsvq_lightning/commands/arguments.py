@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from nsvq_lightning.splats.conventions import Float32s
     from nsvq_lightning.splats.splats import SplatTensors
 
+    # Cameras by the names of their photos, and these.
+    Views = tuple[dict[str, Camera], Scene | None]
+
 
 log = logging.getLogger(__name__)
 
@@ -154,7 +157,7 @@ def folders_beside(path: Path) -> list[Path]:
     return [run, *run.parents][:3]
 
 
-def _found_views(path: Path, root: Path | None) -> "tuple[dict[str, Camera], Scene | None]":
+def _found_views(path: Path, root: Path | None) -> "Views":
     """Cameras by name of the photos that a scene was trained on, and these photos, if a folder of them is named.
 
     That is ``root``, or the one in the settings of the scene's run; photos of a run have the size that it has trained
@@ -188,9 +191,7 @@ def _found_views(path: Path, root: Path | None) -> "tuple[dict[str, Camera], Sce
     return {}, None
 
 
-def known_views(
-    path: Path, root: Path | None, means: "Float32s | None" = None
-) -> "tuple[dict[str, Camera], Scene | None]":
+def known_views(path: Path, root: Path | None, means: "Float32s | None" = None) -> "Views":
     """Cameras by name of the photos that a scene was trained on, or that its run or trainer has left beside it.
 
     They are looked for as ``viewer.html`` in the folder of a run, as ``cameras.json`` of INRIA's trainer, as a COLMAP

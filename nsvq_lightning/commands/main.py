@@ -45,9 +45,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name == "--version":
         say(f"nsvq {__version__}")
         return 0
-    for stream in ("stdout", "stderr"):  # which daemons close
-        if getattr(sys, stream) is None:
-            setattr(sys, stream, open(os.devnull, "w"))  # noqa: SIM115
+    # Daemons close them.
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     # A pipe, too, shows lines as they come; on Windows it accepts only the locale's characters.
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace", line_buffering=True)

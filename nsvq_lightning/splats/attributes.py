@@ -59,7 +59,7 @@ DEFAULT_SIZE = "16k"
 QUANTIZABLE = tuple(name for name, attribute in ATTRIBUTES.items() if attribute.code_share)
 
 
-def codebook_bits(codebooks: Mapping[str, Sequence[int]]) -> tuple[float, float]:
+def codebook_bits(codebooks: Mapping[str, Sequence[float]]) -> tuple[float, float]:
     """Bits of all codebooks, and of the codes of one splat, in files of level ``compact``, about.
 
     Args:

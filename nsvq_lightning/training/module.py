@@ -93,6 +93,7 @@ class SplatModule(LightningModule):
             3DGS.
         rate_strength: How strongly codes are chosen by their bits, which a budget in bytes counts on; 0 for the nearest
             ones.
+        values_per_splat: Most numbers of a codebook for each splat, which it counts on, too.
         stretches: How many splats a run has in which shares of it, from its schedule and how many it has at start and
             end.
         evaluation_splats: What validation, test and prediction render instead of the module's own splats, in
@@ -155,6 +156,7 @@ class SplatModule(LightningModule):
         self.splat_budget: int | None = None
         self.first_points: int | None = None
         self.rate_strength = 0.0
+        self.values_per_splat = math.inf
         self.stretches: Callable[[Schedule, int, int], list[tuple[float, int]]] | None = None
         self.evaluation_splats: SplatTensors | None = None
         self.updates = True

@@ -11,8 +11,9 @@ from density_stage import Stage, make_splats
 
 from nsvq_lightning.callbacks import BudgetedGrowth
 from nsvq_lightning.callbacks.density import add_view
-from nsvq_lightning.callbacks.growth import split_longest
+from nsvq_lightning.callbacks.growth import splats_for_bytes, split_longest
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices
@@ -209,3 +210,17 @@ def test_a_budget_is_needed_and_the_modules_is_taken() -> None:
         growth.limit(stage.module)
     stage.module.splat_budget = 50
     assert growth.limit(stage.module) == 100
+
+
+def test_a_budget_in_bytes_knows_that_codebooks_are_smaller_where_splats_are_few() -> None:
+    books = {"scales": (8192, 3), "quats": (8192, 4), "sh0": (2048, 3), "shN": (2048, 45)}
+
+    def splats(size: int, most: float) -> int:
+        return splats_for_bytes(size, books, 3, Precision(), 0.0, most)
+
+    with pytest.raises(ValueError, match="100000 bytes leave no room beside codebooks"):
+        splats(100_000, math.inf)
+    assert splats(100_000, 0.6) > 10_000
+    # As measured: fox and bonsai in best.yaml.
+    assert splats(657_093, 0.6) == pytest.approx(72_233, rel=0.1)
+    assert splats(1_440_071, 0.6) == splats(1_440_071, math.inf) == pytest.approx(167_805, rel=0.1)
