@@ -35,6 +35,8 @@ MAX_DIM = 8
 def sort_into_leaves(codebook: Array) -> Array:
     """Codes ``[K]`` int32 in an order in which each 16, a leaf, are near each other, and each 256, a node.
 
+    What is larger is cut near the median of the axis along which it is widest. Those with a NaN lie far away.
+
     Raises:
         ValueError: The codebook is not contiguous ``[K, D]``.
         TypeError: It is not float32.
