@@ -108,7 +108,7 @@ def test_a_checkpoint_of_another_phase_is_refused_with_the_way_out(
     checkpoint = finished / "checkpoints" / "last.ckpt"
     assert main(fit(demo_scene, tmp_path, *CODES, f"--ckpt_path={checkpoint}", steps=40)) == 1
     assert re.search(
-        r"^error: .*at iteration 20 in its finetune phase.*callbacks\.phases\.total",
+        r"^error: the module is in its finetune phase, but iteration 20 .*callbacks\.phases\.total",
         capsys.readouterr().err,
         re.MULTILINE,
     )
