@@ -178,7 +178,7 @@ class NearestTracker:
             self._memory = tuple(map(np.concatenate, both))
 
     def _search_boxes(self, x: Array, codebook: Array, rows: Array) -> Array:
-        if self._steps % 32 == 0 or self._order is None:  # boxes in an old order are larger
+        if self._steps % 64 == 0 or self._order is None:  # boxes in an old order are larger
             self._order = sort_into_leaves(codebook)
         self._drift(codebook, 1)
         return box_search(x, codebook, self._order, rows, self._memory[:3], self._travelled)
