@@ -129,7 +129,7 @@ def to_compressed(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> Com
             raise ValueError(f"the codebook of {name} has never been placed: add CodebookInit to the callbacks")
         if not torch.equal(quantizer.decode(some), quantizer.codebook[some]):
             raise ValueError(
-                f"{type(quantizer).__name__} of {name} decodes to other rows than its codebook's, in files"
+                f"{type(quantizer).__name__} of {name} decodes to other rows than its codebook's, and files hold these"
             )
     scene = CompressedScene(
         means=_numpy(splats.means),
