@@ -187,7 +187,7 @@ class Compressor:
         self._known = self.photos.train_cameras if self.photos else self.cameras
         self.cameras = spread(self.cameras or self._known or square_views(self._splats, VIEWS), VIEWS)
         self._is_own = self.photos is None or self.photos.split == OWN
-        if not self._is_own and (likeness := self._psnr(self._splats)) < MIN_PSNR:
+        if not self._is_own and (likeness := self.quality(self._splats)) < MIN_PSNR:
             raise ValueError(f"photos of {self.data.scene.root} are not of this scene: it has {likeness:.1f} dB there")
         # Of settings that are not turned, which needs no training.
         self._trained = cache(self._train)
@@ -244,11 +244,8 @@ class Compressor:
         trim()
         return self.measure.error(candidate.scene.tensors())
 
-    def quality(self, candidate: Candidate) -> float:
-        """PSNR of its pictures in views that it was not trained on, in dB: against their photos, if there are any."""
-        return self._psnr(candidate.scene.tensors())
-
-    def _psnr(self, splats: SplatTensors) -> float:
+    def quality(self, splats: SplatTensors) -> float:
+        """PSNR of splats in views that were not trained on, in dB: against their photos, if there are any."""
         views = self.data.scene
         return evaluate(self._render, splats, map(views.view, spread(views.test, MEASURED)))[0]
 
@@ -268,7 +265,7 @@ class Compressor:
         coded = self._finest_coded(target, splats, not fits)
         if fits and coded:
             lead = LEAD if self._is_own and self._known else 0
-            return max(fits, coded, key=lambda each: self.quality(each) - lead * each.setting.on_basis)
+            return max(fits, coded, key=lambda each: self.quality(each.scene.tensors()) - lead * each.setting.on_basis)
         if found := fits or coded:
             return found
         raise ValueError(f"found no file of {target} bytes: allow more bytes or time")
@@ -492,7 +489,7 @@ def compress(
 
     Raises:
         ValueError: The splats are empty or not finite, cameras do not show them, photos do not fit the cameras, or a
-            limit cannot be met.
+            limit cannot be met; another background.
     """
     if isinstance(splats, CompressedScene):
         scene = splats
@@ -509,6 +506,8 @@ def compress(
     scene = scene.finite()
     if background == "white":
         scene = on_white(scene)
+    elif background != "black":
+        raise ValueError(f"background must be black or white, got {background!r}")
     if cameras:
         check_cameras(cameras, scene.means)
         scene = replace(scene, cameras=trained_by(cameras))

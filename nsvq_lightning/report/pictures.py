@@ -166,6 +166,8 @@ def frame_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
         path.mkdir(parents=True, exist_ok=True)
         names = (path / f"{index:05d}.png" for index in count())
         yield lambda picture: write_png(next(names), picture)
+        if (older := next(names)).exists():
+            log.warning("%s, and what may follow, are frames of an earlier render", older)
 
 
 def write_figure(path: Path, figure: Any) -> None:

@@ -187,5 +187,7 @@ def test_what_was_trained_on_white_is_compressed_and_shown_on_white(
     pictures = [render(splats, camera, background=torch.ones(3)).image.detach() for camera in photos.cameras]
     again = compress(read_scene(plain), photos.cameras, pictures, codebooks="0.5k", steps=8, background="white")
     assert again.background == (1.0, 1.0, 1.0)
+    with pytest.raises(ValueError, match="background must be black or white, got 'grey'"):
+        compress(splats, background="grey")
     assert main(["split", str(root), str(tmp_path / "parts"), "--blocks", "1"]) == 0
     assert "--model.background=white" in capsys.readouterr().out

@@ -33,7 +33,7 @@ def _picture(path: Path) -> np.ndarray[Any, Any]:
 
 
 def test_cameras_of_the_photos_see_what_they_render(
-    scene: Path, demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scene: Path, demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     out = tmp_path / "frames"
     assert _run(scene, "--data.root", demo_scene, "--path", "cameras", "-o", out) == 0
@@ -45,6 +45,9 @@ def test_cameras_of_the_photos_see_what_they_render(
     said = capsys.readouterr()
     assert f"{out}: 9 frames of 96x72\n" in said.out
     assert "9/9" in said.err
+    assert "earlier render" not in caplog.text
+    assert _run(scene, "--data.root", demo_scene, "--frames", "5", "-o", out) == 0
+    assert f"{out / '00005.png'}, and what may follow, are frames of an earlier render" in caplog.text
 
 
 def test_a_run_knows_its_photos(scene: Path, demo_scene: Path, tmp_path: Path) -> None:

@@ -112,8 +112,9 @@ def test_what_cannot_be_is_said_at_once(scenes: tuple[str, str], tmp_path: Path)
     ):
         with pytest.raises(SystemExit):
             planned(fox, wrong)
-    with pytest.raises(ValueError, match=r"ckpt_path=a\.ckpt"):
-        planned(fox, "--ckpt_path=a.ckpt")
+    for own in ("--ckpt_path=a.ckpt", "--trainer.run_folder=a"):
+        with pytest.raises(ValueError, match=r"folders of its own; leave a(\.ckpt)? out"):
+            planned(fox, own)
 
 
 def test_settings_as_a_file_are_the_same_settings(tmp_path: Path) -> None:

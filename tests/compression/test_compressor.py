@@ -76,7 +76,7 @@ def test_a_file_has_at_most_the_bytes_that_it_may_have(small: Compressor, settin
     for target in (len(usual.data), len(usual.data) - 200):
         found = small.finest_within(target, 400)
         assert len(found.data) <= target
-        better = small.quality(found) > small.quality(usual)
+        better = small.quality(found.scene.tensors()) > small.quality(usual.scene.tensors())
         assert len(found.data) >= (1 - 3 * SLACK) * target or better
 
 
@@ -120,7 +120,7 @@ def test_more_bytes_never_cost_quality() -> None:
     assert not set(small.data.scene.test) & set(small.data.scene.train)
     sizes = [len(small.at(setting).data) for setting in (Setting(1000, "0.5k"), Setting(1000, "none"))]
     found = [small.finest_within(int(target), 1000) for target in np.linspace(sizes[0], 1.1 * sizes[1], 8)]
-    qualities = [small.quality(candidate) for candidate in found]
+    qualities = [small.quality(candidate.scene.tensors()) for candidate in found]
     assert all(later > max(qualities[: k + 1]) - 0.05 for k, later in enumerate(qualities[1:]))  # dB
     assert len({candidate.setting for candidate in found}) > 3
     assert found[-1].setting == Setting(1000, "none")
