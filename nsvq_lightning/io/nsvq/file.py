@@ -131,13 +131,10 @@ def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) ->
         One array ``[N]`` per field.
     """
     record = sum(widths)
-    bits = np.unpackbits(np.frombuffer(data, np.uint8), count=rows * record, bitorder="little")
-    fields = []
-    for column in np.split(bits.reshape(rows, record), np.cumsum(widths)[:-1], axis=1):
-        number = np.zeros((rows, 32), np.uint8)
-        number[:, : column.shape[1]] = column
-        fields.append(np.packbits(number, axis=1, bitorder="little").view("<u4")[:, 0])
-    return fields
+    bits = np.unpackbits(np.frombuffer(data, np.uint8), count=rows * record, bitorder="little").reshape(rows, record)
+    columns = np.split(bits, np.cumsum(widths)[:-1], axis=1)
+    numbers = (np.pad(column, ((0, 0), (0, 32 - column.shape[1]))) for column in columns)
+    return [np.packbits(number, axis=1, bitorder="little").view("<u4")[:, 0] for number in numbers]
 
 
 def paper_header(scene: CompressedScene) -> Header:
