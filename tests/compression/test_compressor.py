@@ -90,7 +90,8 @@ def test_from_known_cameras_a_basis_must_be_clearly_better(
     monkeypatch.setattr(small, "_fitting", lambda *_: found["basis"])
     monkeypatch.setattr(small, "_finest_coded", lambda *_: found["codes"])
     monkeypatch.setattr(small, "_known", small._known if knows else ())
-    monkeypatch.setattr(small, "quality", lambda each: 40 + ahead * (each is found["basis"]))
+    opacities = found["basis"].scene.tensors().opacities
+    monkeypatch.setattr(small, "quality", lambda splats: 40 + ahead * torch.equal(splats.opacities, opacities))
     target = len(small.at(Setting(400, "none")).data) - 1
     assert small.finest_within(target, 400) is found[wins]
     # One alone needs no judge, who would render many pictures.
