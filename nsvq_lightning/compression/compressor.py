@@ -16,17 +16,8 @@ from torch.nn import Parameter, ParameterDict
 
 from nsvq_lightning import callbacks as cb
 from nsvq_lightning.callbacks.forecast import iteration_seconds
+from nsvq_lightning.compression import viewpoints
 from nsvq_lightning.compression.basis import components
-from nsvq_lightning.compression.viewpoints import (
-    MEASURED,
-    OWN,
-    VIEWS,
-    Measure,
-    check_cameras,
-    own_scene,
-    showing,
-    square_views,
-)
 from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.datamodule import SceneDataModule
@@ -39,14 +30,7 @@ from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.sampling import trained_by
 from nsvq_lightning.report.numbers import evaluate
-from nsvq_lightning.splats.attributes import (
-    ATTRIBUTES,
-    DEFAULT_SIZE,
-    SIZES,
-    attribute_dims,
-    codebook_bits,
-    codebook_sizes,
-)
+from nsvq_lightning.splats import attributes
 from nsvq_lightning.splats.splats import Splats, SplatTensors, detached
 from nsvq_lightning.training import importance
 from nsvq_lightning.training.module import SplatModule
@@ -102,10 +86,10 @@ def setting_for(size: int, most: int, sh_degree: int, parts: int = 1) -> Setting
     Raises:
         ValueError: There is none.
     """
-    dims = attribute_dims(sh_degree)
-    for name in SIZES:
-        sizes = {each: (codes, dims[each]) for each, codes in codebook_sizes(name).items() if dims[each]}
-        fixed, bits = codebook_bits(sizes)
+    dims = attributes.attribute_dims(sh_degree)
+    for name in attributes.SIZES:
+        sizes = {each: (codes, dims[each]) for each, codes in attributes.codebook_sizes(name).items() if dims[each]}
+        fixed, bits = attributes.codebook_bits(sizes)
         fixed *= parts
         room = int((8 * size - fixed) / (PLACE + bits))
         if room >= SHARE * most:
@@ -114,7 +98,7 @@ def setting_for(size: int, most: int, sh_degree: int, parts: int = 1) -> Setting
         raise ValueError(f"{size} bytes leave room for {max(room, 0)} of {most} splats beside codebooks: allow more")
     codes, dim = sizes.get("shN", (0, 1))
     spare = max(0.0, 8 * size - fixed - most * (PLACE + bits))
-    more = min(spare / (parts * dim * ATTRIBUTES["shN"].code_bits), codes, most / (8 * parts))
+    more = min(spare / (parts * dim * attributes.ATTRIBUTES["shN"].code_bits), codes, most / (8 * parts))
     return Setting(min(most, room), name, more=int(more))
 
 
@@ -185,8 +169,10 @@ class Compressor:
         self._splats = self.scene.tensors()
         self._render = renderer(self.scene)
         self._known = self.photos.train_cameras if self.photos else self.cameras
-        self.cameras = spread(self.cameras or self._known or square_views(self._splats, VIEWS), VIEWS)
-        self._is_own = self.photos is None or self.photos.split == OWN
+        self.cameras = spread(
+            self.cameras or self._known or viewpoints.square_views(self._splats, viewpoints.VIEWS), viewpoints.VIEWS
+        )
+        self._is_own = self.photos is None or self.photos.split == viewpoints.OWN
         if not self._is_own and (likeness := self.quality(self._splats)) < MIN_PSNR:
             raise ValueError(f"photos of {self.data.scene.root} are not of this scene: it has {likeness:.1f} dB there")
         # Of settings that are not turned, which needs no training.
@@ -194,14 +180,14 @@ class Compressor:
         self._weights = cache(self._row_weights)
 
     @cached_property
-    def measure(self) -> Measure:
+    def measure(self) -> viewpoints.Measure:
         """Measures errors."""
-        return Measure(self._splats, self.cameras, self._render)
+        return viewpoints.Measure(self._splats, self.cameras, self._render)
 
     @cached_property
     def data(self) -> SceneDataModule:
         """The views to train on."""
-        return SceneDataModule(self.photos or own_scene(self._splats, self.cameras, self._render), self.seed)
+        return SceneDataModule(self.photos or viewpoints.own_scene(self._splats, self.cameras, self._render), self.seed)
 
     def best(self, splats: int, codebooks: str | None, target_bytes: int | None, max_error: float | None) -> Candidate:
         """The smallest file with an error, the best one of a size, or that with these codebooks; the first asked for.
@@ -213,7 +199,7 @@ class Compressor:
             return self.smallest_within(max_error, splats)
         if target_bytes is not None:
             return self.finest_within(target_bytes, splats)
-        return self.at(Setting(splats, codebooks or DEFAULT_SIZE))
+        return self.at(Setting(splats, codebooks or attributes.DEFAULT_SIZE))
 
     def at(self, setting: Setting) -> Candidate:
         """The scene at a setting."""
@@ -247,7 +233,7 @@ class Compressor:
     def quality(self, splats: SplatTensors) -> float:
         """PSNR of splats in views that were not trained on, in dB: against their photos, if there are any."""
         views = self.data.scene
-        return evaluate(self._render, splats, map(views.view, spread(views.test, MEASURED)))[0]
+        return evaluate(self._render, splats, map(views.view, spread(views.test, viewpoints.MEASURED)))[0]
 
     def finest_within(self, target: int, splats: int) -> Candidate:
         """The best file of at most ``target`` bytes and this many splats: with or without codebooks, by its quality.
@@ -312,7 +298,7 @@ class Compressor:
 
         plain = self.at(Setting(splats, "none"))
         found = [plain] if fits(plain) else []
-        settings = [Setting(splats, name) for name in SIZES]
+        settings = [Setting(splats, name) for name in attributes.SIZES]
         if self.scene.sh_degree:
             settings.insert(0, Setting(splats, "none", True))
         first, end = -1, len(settings)  # the last one with a file that fits, and the first one without
@@ -357,7 +343,7 @@ class Compressor:
 
     def _train(self, setting: Setting) -> CompressedScene:
         """Select and quantize splats, and train what is left."""
-        sizes = {} if setting.codebooks == "none" else dict(codebook_sizes(setting.codebooks))
+        sizes = {} if setting.codebooks == "none" else dict(attributes.codebook_sizes(setting.codebooks))
         if "shN" in sizes:
             sizes["shN"] += setting.more
         if self.parts > 1 and (sizes or setting.splats < len(self.scene)):
@@ -414,7 +400,7 @@ class Compressor:
             log.info("part %d of %d", number + 1, self.parts)
             part = self.scene.take(rows)
             minutes, steps = self.minutes * len(part) / 1e6, 1 if self.stopped else self.steps
-            cameras = showing(self._known, part.means, VIEWS)
+            cameras = viewpoints.showing(self._known, part.means, viewpoints.VIEWS)
             own = Compressor(part, cameras, None, self.storage, self.seed, minutes, steps)
             left = max(1, setting.splats * len(part) // len(self.scene))
             found.append(own._train(replace(setting, splats=left)))
@@ -465,7 +451,7 @@ def compress(
     *,
     target_bytes: int | None = None,
     max_error: float | None = None,
-    codebooks: str = DEFAULT_SIZE,
+    codebooks: str = attributes.DEFAULT_SIZE,
     left: int | None = None,
     antialiased: bool = False,
     background: Literal["black", "white"] = "black",
@@ -500,7 +486,7 @@ def compress(
             NERFSTUDIO.get(name, name): torch.as_tensor(values).detach().cpu().float().numpy()
             for name, values in named.items()
         }
-        if missing := set(ATTRIBUTES) - {"shN"} - rows.keys():
+        if missing := set(attributes.ATTRIBUTES) - {"shN"} - rows.keys():
             raise ValueError(f"the splats have no {', '.join(sorted(missing))}")
         scene = CompressedScene.from_rows(rows, antialiased)
     scene = scene.finite()
@@ -509,9 +495,9 @@ def compress(
     elif background != "black":
         raise ValueError(f"background must be black or white, got {background!r}")
     if cameras:
-        check_cameras(cameras, scene.means)
+        viewpoints.check_cameras(cameras, scene.means)
         scene = replace(scene, cameras=trained_by(cameras))
-    views = own_scene(scene.tensors(), cameras, photos=photos) if photos else None
+    views = viewpoints.own_scene(scene.tensors(), cameras, photos=photos) if photos else None
     compressor = Compressor(scene, cameras, views, **settings)
     left = len(scene) if left is None else min(left, len(scene))
     return compressor.best(left, codebooks, target_bytes, max_error).scene

@@ -1,6 +1,7 @@
 """Where the photos and masks of a scene are: under the names that its model gives, or under the nearest ones."""
 
 import logging
+import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -119,6 +120,10 @@ def photos_below(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if path.suffix.lower() in PHOTOS and path.is_file())
 
 
+# What tells folders of masks.
+_OF_MASKS = re.compile("(?<!un)mask", re.IGNORECASE)
+
+
 def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]) -> tuple[Path, int]:
     """The folder to read photos from, and the divisor of their size that is still to be applied.
 
@@ -138,7 +143,7 @@ def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]
     if (root / name).is_dir():
         return root / name, factor or 1
     plain = [given.replace("\\", "/") for given in names]
-    folders = [path for depth in ("*", "*/*") for path in sorted(root.glob(depth)) if "mask" not in path.name]
+    folders = [path for depth in ("*", "*/*") for path in sorted(root.glob(depth)) if not _OF_MASKS.search(path.name)]
     found = [path for path in (root, *folders) if all((path / given).is_file() for given in plain)]
     if len(found) != 1:
         others = " and ".join(str(path.relative_to(root)) for path in found)
@@ -180,9 +185,10 @@ def find_masks(
     usual = [root / name for name in folders if (root / name).is_dir()][:1]
     places = usual
     if not usual and not has_own and folders[-1] == "masks":
-        places = [path for path in sorted(root.glob("*")) if path.is_dir() and "mask" in path.name.lower()]
+        below = sorted({*root.glob("*"), *photos.glob("*")})
+        places = [path for path in below if path.is_dir() and _OF_MASKS.search(path.name)]
         places.append(photos)
-    found = {place: masks for place in places if any(masks := _masks_in(place, named, beside=place == photos))}
+    found = {place: masks for place in places if any(masks := _masks_in(place, named, files, place == photos))}
     shown = " and ".join(map(str, found or usual))
     if len(found) == 1:
         if not usual:
@@ -206,9 +212,11 @@ def find_masks(
 _MASK_NAMES = ("{}_mask", "{}.mask", "mask_{}")
 
 
-def _masks_in(folder: Path, named: Sequence[tuple[str, str]], beside: bool) -> list[Path | None]:
-    """The masks in a folder of photos by either name; ``beside`` the photos, none has the name of its photo."""
-    files = _Files(folder, photos_below(folder))
+def _masks_in(
+    folder: Path, named: Sequence[tuple[str, str]], photos: Sequence[Path], beside: bool
+) -> list[Path | None]:
+    """The masks in a folder of photos by either name: no photos; ``beside`` these, none has the name of its photo."""
+    files = _Files(folder, sorted({*photos_below(folder)} - {*photos}))
     found: list[Path | None] = []
     for names in named:
         wanted = [f"{name}.png" for name in names]

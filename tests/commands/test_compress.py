@@ -24,8 +24,7 @@ from nsvq_lightning.splats.splats import Splats, detached
 
 @pytest.fixture(autouse=True)
 def few_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("viewpoints", "compressor"):
-        monkeypatch.setattr(f"nsvq_lightning.compression.{module}.VIEWS", 4)
+    monkeypatch.setattr("nsvq_lightning.compression.viewpoints.VIEWS", 4)
 
 
 def test_a_file_is_compressed_and_again_to_the_same_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -96,7 +96,14 @@ def test_the_only_folder_that_has_the_photos_is_used(tmp_path: Path, place: str)
 
 @pytest.mark.parametrize(
     "name",
-    ["mask/{}.png", "Masks/{}.JPG.PNG", "images/{}_mask.png", "images/{}.jpg.png", "images_masks/mask_{}.PNG"],
+    [
+        "mask/{}.png",
+        "Masks/{}.JPG.PNG",
+        "images/{}_mask.png",
+        "images/{}.jpg.png",
+        "images_masks/mask_{}.PNG",
+        "images/masks/{}.png",
+    ],
 )
 def test_masks_are_found_in_the_only_place_that_has_some(
     tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
@@ -109,6 +116,14 @@ def test_masks_are_found_in_the_only_place_that_has_some(
     assert masks_of(tmp_path, "masks", "1.jpg", "2.jpg") == [None, None]
     assert "are not used: choose a folder (--data.masks)" in caplog.text
     assert masks_of(tmp_path, "more_masks", "1.jpg", "2.jpg") == [None, tmp_path / "more_masks/2.png"]
+
+
+def test_a_photo_is_no_mask(tmp_path: Path) -> None:
+    write(tmp_path, "images/1.jpg", "images/mask_1.jpg", "images/2.jpg", "unmasked/1.jpg", "unmasked/3.jpg")
+    photos = [ColmapImage(name, 1, np.eye(4)) for name in ("1.jpg", "mask_1.jpg", "2")]
+    files = [tmp_path / "images" / name for name in ("1.jpg", "mask_1.jpg", "2.jpg")]
+    assert find_masks(photos, files, tmp_path / "images", tmp_path, ["masks"]) == [None, None, None]
+    assert photo_folder(tmp_path, "pictures", None, ["3.jpg"])[0] == tmp_path / "unmasked"
 
 
 def test_masks_that_are_not_clear_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
