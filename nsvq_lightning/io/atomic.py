@@ -45,8 +45,10 @@ def atomic_path(path: StrPath) -> Iterator[Path]:
         with suppress(FileNotFoundError):
             temporary.chmod(target.stat().st_mode & 0o7777)
         os.replace(temporary, target)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (None, str(temporary)):  # as of a full disk
+            error.filename = str(path)
         raise
     # Make the new name itself survive a power failure, where the system can open folders.
     with suppress(OSError):

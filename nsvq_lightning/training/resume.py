@@ -6,6 +6,7 @@ import sys
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, is_dataclass, replace
 from hashlib import sha256
+from io import BytesIO
 from operator import attrgetter
 from pathlib import Path
 from pickle import UnpicklingError
@@ -18,6 +19,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
 from nsvq_lightning.data.scene import Scene
+from nsvq_lightning.io.atomic import atomic_write, make_folder_of
 from nsvq_lightning.io.errors import FormatError, Json
 from nsvq_lightning.splats.splats import sh_degree_of
 from nsvq_lightning.training.schedule import Schedule
@@ -216,7 +218,18 @@ def check_scene(checkpoint: Mapping[str, Any], scene: Scene) -> None:
 
 
 class PlainCheckpointIO(TorchCheckpointIO):
-    """Lightning's reading and writing of checkpoints, with :func:`read_checkpoint` for local files."""
+    """Lightning's reading and writing of checkpoints; local files with :func:`read_checkpoint` and in their folder."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        """Write a checkpoint in one step; Lightning first writes it where the system has temporary files."""
+        if "://" in str(path):
+            super().save_checkpoint(checkpoint, path, storage_options)
+            return
+        content = BytesIO()  # straight into the file, torch would hide that a disk is full
+        torch.save(checkpoint, content)
+        make_folder_of(Path(path))
+        with atomic_write(path) as file:
+            file.write(content.getbuffer())
 
     def load_checkpoint(self, path: str | Path, map_location: Any = None, weights_only: bool | None = None) -> Any:
         """Read a checkpoint; remote ones as Lightning does, but also refusing anything that could run code.

@@ -28,6 +28,18 @@ def test_failure_keeps_the_old_file_and_leaves_no_litter(tmp_path: Path) -> None
     assert os.listdir(tmp_path) == ["scene.ply"]
 
 
+def test_a_full_disk_is_told_with_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "scene.ply"
+
+    def write() -> None:
+        # One in the other, as for checkpoints.
+        with atomic_path(path) as outer, atomic_write(outer):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(OSError, match=r"No space left on device: '.*/scene\.ply'"):
+        write()
+
+
 def test_permissions_are_those_of_an_ordinary_file_or_of_the_old_one(tmp_path: Path) -> None:
     plain, ours = tmp_path / "plain", tmp_path / "ours"
     plain.write_bytes(b"")
@@ -128,6 +140,7 @@ def test_no_file_of_the_package_is_written_in_place() -> None:
         ("commands/sweep.py", "open"),
         ("commands/main.py", "open"),  # to nowhere
         ("report/pictures.py", "savefig"),  # into memory
+        ("training/resume.py", "save"),  # the same
     }
     writers = {"write_text", "write_bytes", "imwrite", "savefig", "savez", "tofile", "write_binary"}
     found = set()

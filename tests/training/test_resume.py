@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import tempfile
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -226,3 +227,12 @@ def test_the_same_quantizers_go_on_whatever_they_are_called() -> None:
         check(saved(module), same)
     paper = quantizing(codebooks="0.5k")  # without SH coefficients there are three codebooks
     check(saved(paper), quantizing(codebooks={"scales": 512, "quats": 512, "sh0": 128, "shN": 7}))
+
+
+def test_checkpoints_are_written_where_they_belong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The folder of temporary files may be small, or on another disk."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    path = tmp_path / "new" / "a.ckpt"
+    PlainCheckpointIO().save_checkpoint({"a": torch.ones(3)}, path)
+    assert torch.equal(torch.load(path)["a"], torch.ones(3))
+    assert list(path.parent.iterdir()) == [path]

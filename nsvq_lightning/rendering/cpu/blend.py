@@ -14,19 +14,9 @@ import numpy as np
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel
 from nsvq_lightning.compute.rows import clear_between, share
+from nsvq_lightning.rendering import formulas
 from nsvq_lightning.rendering.cpu import records as rec
-from nsvq_lightning.rendering.formulas import (
-    ALPHA_MAX,
-    LOG2_ALPHA_MIN,
-    TILE,
-    TRANSMITTANCE_MIN,
-    TWO_LN2,
-    alpha_of,
-    blend_step,
-    dot3,
-    exponent,
-    fma3,
-)
+from nsvq_lightning.rendering.formulas import TILE, TRANSMITTANCE_MIN, TWO_LN2, dot3, exponent, fma3
 
 BATCH = 128
 BLOCKS = 16
@@ -106,7 +96,7 @@ def reachable_blocks(batch, o, x, y, grid):
     slope_x = simd.get(batch, o + rec.SLOPE_X)
     slope_y = simd.get(batch, o + rec.SLOPE_Y)
     peak = highest_exponent(a, b, c, slope_x, slope_y, left, left + side, top, top + side)
-    return simd.mask_bits(peak >= LOG2_ALPHA_MIN - REACH_MARGIN - simd.get(batch, o + rec.LOG2_OPACITY))
+    return simd.mask_bits(peak >= formulas.LOG2_ALPHA_MIN - REACH_MARGIN - simd.get(batch, o + rec.LOG2_OPACITY))
 
 
 @inline
@@ -116,7 +106,7 @@ def alpha_at(batch, r, x, y):
     u0 = simd.get(batch, r + rec.X)
     v0 = simd.get(batch, r + rec.Y)
     power, _, _ = exponent(a, b, c, u0, v0, simd.get(batch, r + rec.LOG2_OPACITY), x, y)
-    _, alpha = alpha_of(power)
+    _, alpha = formulas.alpha_of(power)
     return alpha
 
 
@@ -397,10 +387,10 @@ def splat_backward(records, row, blocks, corner, wanted, state):
             d = simd.fma(simd.load(state, s + BACK_DEPTH), z, d)
         t = simd.load(state, s + BACK_T)
         rest = simd.load(state, s + BACK_REST)
-        raw, alpha, after, open_, weight = blend_step(power, t)
+        raw, alpha, after, open_, weight = formulas.blend_step(power, t)
         simd.store(state, s + BACK_REST, simd.fnma(weight, d, rest))
         simd.store(state, s + BACK_T, simd.maximum(after, TINY))
-        h = simd.where(open_ & (raw <= ALPHA_MAX), alpha / (1 - alpha) * (t * d - rest), 0)
+        h = simd.where(open_ & (raw <= formulas.ALPHA_MAX), alpha / (1 - alpha) * (t * d - rest), 0)
         s_color = fma3(weight, g, s_color)
         hu, hv = h * u, h * v
         s_h, s_u, s_v = s_h + h, s_u + hu, s_v + hv

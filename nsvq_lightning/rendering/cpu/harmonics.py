@@ -7,17 +7,7 @@ from nsvq_lightning.compute.jit import inline
 from nsvq_lightning.compute.rows import clear
 from nsvq_lightning.rendering import formulas
 from nsvq_lightning.rendering.cpu import records as rec
-from nsvq_lightning.rendering.formulas import (
-    C0,
-    bands1,
-    bands2,
-    bands3,
-    clamped,
-    fma3,
-    mean_gradient,
-    scale3,
-    unit_direction,
-)
+from nsvq_lightning.rendering.formulas import C0, bands1, bands2, bands3, unit_direction
 
 # How many splats ahead the rows of a list are prefetched.
 AHEAD = 32
@@ -66,7 +56,7 @@ def add_bands(columns, first, basis, rgb):
     for i in range(len(basis)):
         o = 48 * (first + i)
         coefficient = simd.load(columns, o), simd.load(columns, o + 16), simd.load(columns, o + 32)
-        rgb = fma3(basis[i], coefficient, rgb)
+        rgb = formulas.fma3(basis[i], coefficient, rgb)
     return rgb
 
 
@@ -95,7 +85,7 @@ def color_range(camera, means, colors, bands, ids, first, last, records):
         direction, _ = unit_direction(rec.get3(camera, rec.POSITION), mean)
         if degree > 0:
             gather_sh(shN, ids, start, stride, coefficients, scratch)
-        rgb = clamped(color(degree, direction, simd.gather_rows3(sh0, ids, start), scratch))
+        rgb = formulas.clamped(color(degree, direction, simd.gather_rows3(sh0, ids, start), scratch))
         for channel in range(3):
             simd.store(scratch, 16 * channel, rgb[channel])
         for lane in range(min(16, last - start)):
@@ -152,7 +142,7 @@ def color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN):
     columns, gradient, e = simd.scratch(COLUMNS), simd.scratch(COLUMNS), simd.scratch(256)
     if degree > 0:
         gather_sh(shN, ids, start, stride, coefficients, columns)
-    simd.scatter_rows3(g_sh0, ids, start, scale3(C0, rgb))
+    simd.scatter_rows3(g_sh0, ids, start, formulas.scale3(C0, rgb))
     if degree == 0:
         scatter_sh(g_shN, gradient, ids, start, stride, 0)
         return simd.broadcast(0), simd.broadcast(0), simd.broadcast(0)
@@ -162,4 +152,4 @@ def color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN):
     if degree > 2:
         put_bands(gradient, e, columns, 8, bands3(d), rgb)
     scatter_sh(g_shN, gradient, ids, start, stride, coefficients)
-    return mean_gradient(d, inverse, direction_gradient(degree, d, e))
+    return formulas.mean_gradient(d, inverse, direction_gradient(degree, d, e))
