@@ -1,5 +1,6 @@
 """The ``.ply`` of 3D Gaussian Splatting, which every viewer reads (Kerbl et al. 2023, the authors' layout)."""
 
+import logging
 import math
 import os
 import re
@@ -18,6 +19,8 @@ from nsvq_lightning.io.numbers import FLAT, finite_logits, finite_logs, logits_o
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
 from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s
+
+log = logging.getLogger(__name__)
 
 _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _TYPES = {
@@ -50,6 +53,8 @@ _CHUNK = 256
 # Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene.
 _ROWS = 1 << 12
 _RGB = ["red", "green", "blue"]
+# Width of the smoothing filter of a splat, in scene units.
+_FILTER = "filter_3D"
 # The normals of points, which other programs expect, are 0 unless an attribute is called so.
 _UNUSED = [] if any("nx" in attribute.ply.split() for attribute in ATTRIBUTES.values()) else ["nx", "ny", "nz"]
 # Order of the columns.
@@ -281,7 +286,8 @@ def read_ply(path: StrPath) -> CompressedScene:
     Properties may come in any order and any number type, binary (either byte order) or ascii; with or without normals.
     The number of ``f_rest`` properties gives the SH degree, 0 to 3; other properties and elements are skipped. Discs
     (a third scale of -inf, or none) get the thickness :data:`~nsvq_lightning.io.numbers.FLAT`; ``red green blue`` stand
-    in for ``f_dc_0`` to 2. A compressed ``.ply`` of PlayCanvas is known by its header.
+    in for ``f_dc_0`` to 2. The widths ``filter_3D`` of Mip-Splatting (Yu et al. 2024) are added to those of the splats,
+    √(σ² + f²), whose opacities fall by as much as they grow. A compressed ``.ply`` of PlayCanvas is known by its header.
 
     Raises:
         FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.
@@ -309,6 +315,12 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
     rows["scales"] = finite_logs(rows["scales"])
     # Writers that store opacity as a byte make 0 and 255 infinite logits.
     rows["opacities"] = finite_logits(rows["opacities"])
+    if _FILTER in header.properties:
+        log.info("%s: %s, the filter of Mip-Splatting, becomes part of scales and opacities", path, _FILTER)
+        widths = np.concatenate([*read_ply_columns(path, header, [_FILTER])])
+        wider = np.log(np.hypot(np.exp(rows["scales"]), widths))
+        kept = np.exp((rows["scales"] - wider).sum(1, keepdims=True))
+        rows |= {"scales": wider, "opacities": logits_of(kept * opacity_of(rows["opacities"]))}
     return rows
 
 

@@ -234,6 +234,20 @@ def test_discs_are_read_with_next_to_no_thickness(tmp_path: Path, caplog: pytest
     assert "dropped 2 of 5 splats with non-finite values: scales in 2 rows" in caplog.text
 
 
+def test_the_filter_of_mip_splatting_becomes_part_of_the_splats(tmp_path: Path) -> None:
+    splats = scene(5)
+    widths = np.array([0, 1e-3, 0.1, 1, 100], np.float32)
+    columns = [_values(splats, row) | {"filter_3D": float(widths[row])} for row in range(5)]
+    table = {name: np.array([row[name] for row in columns], np.float32) for name in columns[0]}
+    found = _columns(tmp_path / "a.ply", table)
+    sizes = np.exp(splats.rows("scales").astype(float))
+    wider = np.sqrt(sizes**2 + widths[:, None] ** 2)
+    assert np.allclose(np.exp(found.rows("scales")), wider, rtol=1e-5)
+    opacities = 1 / (1 + np.exp(-splats.opacities.astype(float)))
+    expected = opacities * (sizes / wider).prod(1)
+    assert np.allclose(1 / (1 + np.exp(-found.opacities.astype(float))), expected, rtol=1e-4)
+
+
 @pytest.mark.parametrize(("kind", "full"), [("u1", 255), ("u2", 65535), ("u2", 255), ("f4", 1), ("f4", 255), ("f8", 1)])
 def test_colours_stand_in_for_coefficients(tmp_path: Path, kind: str, full: int) -> None:
     """Oracle: colour = 0.5 + f_dc / (2 √π)."""
