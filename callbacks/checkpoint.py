@@ -209,7 +209,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
 
 
 def _write(trainer: Trainer, path: Path) -> None:
-    """Write a checkpoint in one step; another trainer than ours writes where the system has temporary files, and moves."""
+    """Write a checkpoint in one step; other trainers than ours write where the system has temporary files, and move."""
     # weights_only=False here: save the optimiser's state too. The file holds plain data all the same.
     make_folder_of(path)
     with atomic_path(path) if trainer.is_global_zero else nullcontext(path) as target:

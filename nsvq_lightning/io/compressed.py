@@ -100,11 +100,11 @@ class CompressedScene:
             raise ValueError(f"cameras must be at most {MAX_CAMERAS} finite positions and focal lengths above 0")
 
     @classmethod
-    def from_splats(cls, splats: "SplatTensors", **header: Any) -> "CompressedScene":
+    def from_splats(cls, splats: "SplatTensors | CompressedScene", **header: Any) -> "CompressedScene":
         """A copy of splats, on any device, without any codebook: valid, but not compressed.
 
         Args:
-            splats: The splats.
+            splats: The splats; a compressed scene is returned as it is.
             header: ``config``, ``metrics`` and ``origin``.
 
         Raises:
@@ -112,6 +112,8 @@ class CompressedScene:
         """
         from nsvq_lightning.splats.splats import check_shapes, detached
 
+        if isinstance(splats, CompressedScene):
+            return splats
         tensors = detached(splats)._asdict()
         check_shapes(tensors)
         return cls.from_rows({name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}, **header)

@@ -96,10 +96,8 @@ def save(scene: "SplatTensors | CompressedScene", path: StrPath, storage: Storag
     entry = format_of(path)
     if entry.write is None:
         raise ValueError(f"cannot write {path}: {suffix_of(path)} is only read")
-    if not isinstance(scene, CompressedScene):
-        scene = CompressedScene.from_splats(scene)
     with naming_file(path):
-        scene = scene.finite()
+        scene = CompressedScene.from_splats(scene).finite()
     if any(scene.origin) and not entry.native:
         logger.warning("%s: the origin %s of the positions is not stored; add it in the viewer", path, scene.origin)
     if entry.native:

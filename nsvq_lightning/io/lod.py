@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,7 @@ LEAF, FILE = 1 << 14, 1 << 17
 
 
 def write_lod(
-    path: StrPath, scene: CompressedScene, *, coarser: Sequence[CompressedScene] = (), palette: int = PALETTE_LIMIT
+    path: StrPath, scene: CompressedScene, *, coarser: Sequence[Any] = (), palette: int = PALETTE_LIMIT
 ) -> int:
     """Write a scene as streamed SOG: ``lod-meta.json`` and, beside it, the folders that it names.
 
@@ -39,7 +40,7 @@ def write_lod(
     Args:
         path: The ``lod-meta.json``.
         scene: The finest level.
-        coarser: Coarser levels of the same scene, finest first.
+        coarser: Coarser levels of the same scene, finest first, each as :func:`nsvq_lightning.save` takes them.
         palette: See :func:`nsvq_lightning.io.sog.sog_contents`.
 
     Returns:
@@ -48,7 +49,7 @@ def write_lod(
     Raises:
         ValueError: A level is not coarser than the one before it.
     """
-    levels = [scene, *(level.finite() for level in coarser)]
+    levels = [scene, *(CompressedScene.from_splats(level).finite() for level in coarser)]
     target = Path(path)
     counts = [len(level) for level in levels]
     if any(a <= b for a, b in itertools.pairwise(counts)):

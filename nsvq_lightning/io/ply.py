@@ -287,7 +287,7 @@ def read_ply(path: StrPath) -> CompressedScene:
     The number of ``f_rest`` properties gives the SH degree, 0 to 3; other properties and elements are skipped. Discs
     (a third scale of -inf, or none) get the thickness :data:`~nsvq_lightning.io.numbers.FLAT`; ``red green blue`` stand
     in for ``f_dc_0`` to 2. The widths ``filter_3D`` of Mip-Splatting (Yu et al. 2024) are added to those of the splats,
-    √(σ² + f²), whose opacities fall by as much as they grow. A compressed ``.ply`` of PlayCanvas is known by its header.
+    √(σ² + f²), and opacities fall by as much as these grow. A compressed ``.ply`` of PlayCanvas is known by its header.
 
     Raises:
         FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.

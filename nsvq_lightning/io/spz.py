@@ -230,9 +230,10 @@ def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
         if len(contents[name]) < size:
             raise FormatError(f"truncated: {name} of {header.count} splats has {len(contents[name])} of {size} bytes")
     # Extensions follow the arrays; reading to the end of the stream verifies its checksum.
-    extensions = _inflate(gunzip, gunzip.unconsumed_tail, _MAX_EXTENDED)
+    most = _MAX_EXTENDED + 6 * header.count  # so many have levels of detail
+    extensions = _inflate(gunzip, gunzip.unconsumed_tail, most)
     if not gunzip.eof:
-        raise FormatError(f"truncated, or more than {_MAX_EXTENDED} bytes of extensions: the gzip stream has no end")
+        raise FormatError(f"truncated, or more than {most} bytes of extensions: the gzip stream has no end")
     return _with_axes(header, extensions), contents
 
 
@@ -255,6 +256,8 @@ def _parse(start: bytes, file_bytes: int) -> SpzHeader:
         raise FormatError(f"damaged: SH degree {sh_degree}, not 0 to 4")
     if fraction_bits > MAX_FRACTION:
         raise FormatError(f"damaged: {fraction_bits} fractional bits, more than {MAX_FRACTION}")
+    if strange := flags & ~(ANTIALIASED | _EXTENDED):
+        logger.warning("unknown flags 0x%02x of .spz: if they mean levels of detail, these are not told apart", strange)
     check_room("splats", count, file_bytes)
     return SpzHeader(version, count, sh_degree, fraction_bits, flags)
 

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
-from nsvq_lightning.compute.memory import check_tensor, flat, outside, recycled
+from nsvq_lightning.compute.memory import check_inside, check_tensor, flat, recycled
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside, share
 from nsvq_lightning.quantize.scores import new_lanes
 
@@ -268,7 +268,7 @@ def substitute(
     blocks = -(-len(rows) // _ROWS)
     tables = map(flat, (x, rows, codebook, codes, out))
     if _forward(x.shape[1])(blocks, seed, F(aim), F(spread), *tables):
-        raise _missing(x, rows, codebook, codes)
+        _check_inside(x, rows, codebook, codes)
     return out
 
 
@@ -287,11 +287,10 @@ def check_inputs(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, **cho
         check_tensor(name, table, (len(rows), x.shape[1]), x.device)
 
 
-def _missing(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> ValueError:
-    """The error for a row or a code that is out of range."""
-    if ((rows < 0) | (rows >= len(x))).any():
-        return outside("rows", rows.numpy(), len(x))
-    return outside("codes", codes.numpy(), len(codebook))
+def _check_inside(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> None:
+    """Name the row or the code that a kernel has found out of range."""
+    check_inside("rows", rows.numpy(), len(x))
+    check_inside("codes", codes.numpy(), len(codebook))
 
 
 def substitute_backward(
@@ -313,6 +312,6 @@ def substitute_backward(
     thread_count()
     tables = map(flat, (grad, x, rows, codebook, codes, out, grad_x))
     if _backward(x.shape[1])(parts, *tables, sums):
-        raise _missing(x, rows, codebook, codes)
+        _check_inside(x, rows, codebook, codes)
     np.add.reduce(sums, axis=0, out=grad_codebook.numpy().reshape(-1))
     return grad_x, grad_codebook

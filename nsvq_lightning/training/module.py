@@ -241,8 +241,8 @@ class SplatModule(LightningModule):
         check_can_train(self.trainer.strategy.root_device, self.backend)
         if self.trainer.precision != "32-true":
             raise ValueError(
-                f"splats train in float32, trainer.precision is {self.trainer.precision}: kernels compute in float32 "
-                "whatever it says, and a scaled loss would grow splats needlessly; leave it at 32-true"
+                "splats train in float32, and kernels compute in it whatever trainer.precision says; a scaled loss "
+                "would grow splats needlessly: leave it at 32-true"
             )
         for callback in self.trainer.callbacks:  # type: ignore[attr-defined]  # Lightning does not type it
             if isinstance(callback, StochasticWeightAveraging | WeightAveraging):

@@ -73,6 +73,7 @@ def test_points_are_where_the_cameras_see_them(demo_scene: Path, tmp_path: Path,
         ("FULL_OPENCV", (0.1, -0.02, 0, 0, 0.01, 0, 0, 0), {"k1": 0.1, "k2": -0.02, "k3": 0.01}),
         ("OPENCV_FISHEYE", (0.05, 0.01, 0.002, 0.001),
          {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k2": 0.01, "k3": 0.002, "k4": 0.001}),
+        ("FULL_OPENCV", (0.1, 0, 0.002, 0, 0.01, 0, 0, 0), {"k1": 0.1, "distortion_params": [9, 0, 0.01, 0, 0.002, 0]}),
         ("OPENCV_FISHEYE", (0.05, 0, 0, 0), {"camera_model": None, "is_fisheye": True, "k1": 0.05}),
     ],
 )  # fmt: skip

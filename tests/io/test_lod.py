@@ -56,7 +56,7 @@ def test_each_level_has_all_its_splats_in_the_boxes_of_its_leaves(tmp_path: Path
 
 def test_an_index_of_the_first_writers_and_what_surrounds_a_scene(tmp_path: Path) -> None:
     path, scene, sky = tmp_path / "lod-meta.json", plain_scene(20, 1), plain_scene(8, 1, seed=1)
-    save(scene, path, coarser=[plain_scene(7, 1)])
+    save(scene, path, coarser=[plain_scene(7, 1).decode()])
     save(sky, tmp_path / "env.sog")
     index = json.loads(path.read_text())
     for name in ("version", "count", "counts"):

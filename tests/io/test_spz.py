@@ -122,3 +122,11 @@ def test_of_degree_4_the_first_three_are_read(tmp_path: Path, degree: int, caplo
     read = read_scene(tmp_path / "x.spz")
     np.testing.assert_allclose(read.values("shN"), (levels[:, :15] - 128.0) / 128)
     assert ("of SH degree 4, degrees up to 3 are read" in caplog.text) == (degree == 4)
+
+
+def test_flags_that_are_not_known_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """0x80 are the levels of detail of Spark: six more bytes a splat."""
+    head = struct.pack("<4sIIBBBB", b"NGSP", 3, 200_000, 0, 12, 0x80, 0)
+    (tmp_path / "x.spz").write_bytes(gzip.compress(head + bytes(200_000 * 26), 1))
+    assert len(read_scene(tmp_path / "x.spz")) == 200_000
+    assert "unknown flags 0x80" in caplog.text
