@@ -263,6 +263,8 @@ def continuation(checkpoint: Path) -> str:
 
 def summary(folder: Path, metrics: Json) -> str:
     """The results of a run, in a few lines."""
+    page = folder / "viewer.html"
+    way = f"open {page}, or " if page.is_file() else ""
     return (
         f"{folder}\n"
         f"  PSNR {metrics['psnr'] or math.inf:.2f} dB, SSIM {metrics['ssim'] or math.nan:.4f} "
@@ -270,5 +272,5 @@ def summary(folder: Path, metrics: Json) -> str:
         f"  {metrics['num_splats']} splats in {metrics['file_bytes']} bytes (scene.nsvq), "
         f"{metrics['ratio']:.1f} times smaller than the plain .ply\n"
         f"  {metrics['train_seconds']:.0f} s of training\n"
-        f"look at it: open {folder / 'viewer.html'}, or {shlex.join(['nsvq', 'view', str(folder)])}\n"
+        f"look at it: {way}{shlex.join(['nsvq', 'view', str(folder)])}\n"
     )

@@ -151,11 +151,10 @@ class _Frame:
         width, height = self._size()
         fx, fy = self._focals(width, height)
         pinhole = (fx, fy, self.number("cx", width / 2), self.number("cy", height / 2))
-        names = "k1", "k2", "k3", "k4", "p1", "p2"
         listed = _numbers(self.values.get("distortion_params", np.zeros(6)))  # as nerfstudio has it
         if listed.shape != (6,):
             raise self.error("has distortion_params that are not 6 numbers")
-        k1, k2, k3, k4, p1, p2 = (self.number(*known) for known in zip(names, listed.tolist(), strict=True))
+        k1, k2, k3, k4, p1, p2 = map(self.number, ("k1", "k2", "k3", "k4", "p1", "p2"), listed)
         usual = "OPENCV_FISHEYE" if self.values.get("is_fisheye") is True else "OPENCV"
         model = self.values.get("camera_model", usual)
         if model == "OPENCV_FISHEYE" and not (p1 or p2):

@@ -13,7 +13,6 @@ from contextlib import suppress
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
@@ -30,7 +29,7 @@ LEAF, FILE = 1 << 14, 1 << 17
 
 
 def write_lod(
-    path: StrPath, scene: CompressedScene, *, coarser: Sequence[Any] = (), palette: int = PALETTE_LIMIT
+    path: StrPath, scene: CompressedScene, *, coarser: Sequence[CompressedScene] = (), palette: int = PALETTE_LIMIT
 ) -> int:
     """Write a scene as streamed SOG: ``lod-meta.json`` and, beside it, the folders that it names.
 

@@ -2,7 +2,6 @@
 
 import logging
 import math
-import os
 from collections import Counter
 from typing import Any
 
@@ -95,8 +94,7 @@ class Clamped:
         """Warn how many of ``count`` splats were clamped to the format's range."""
         changed = ", ".join(f"{name} {splats}" for name, splats in self._counts.items() if splats)
         if changed:
-            suffix = os.path.splitext(path)[1].lower()
-            logger.warning(f"{path}: out of the range of {suffix} files, clamped to it: {changed} (of {count} splats)")
+            logger.warning(f"{path}: out of the range of its format, clamped to it: {changed} (of {count} splats)")
 
 
 def power_below(value: float) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
-from nsvq_lightning.io.numbers import FLAT, finite_logits, finite_logs, logits_of, opacity_of
+from nsvq_lightning.io.numbers import FLAT, Clamped, finite_logits, finite_logs, logits_of, opacity_of
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
 from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s
@@ -53,8 +53,6 @@ _CHUNK = 256
 # Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene.
 _ROWS = 1 << 12
 _RGB = ["red", "green", "blue"]
-# Width of the smoothing filter of a splat, in scene units.
-_FILTER = "filter_3D"
 # The normals of points, which other programs expect, are 0 unless an attribute is called so.
 _UNUSED = [] if any("nx" in attribute.ply.split() for attribute in ATTRIBUTES.values()) else ["nx", "ny", "nz"]
 # Order of the columns.
@@ -315,9 +313,9 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
     rows["scales"] = finite_logs(rows["scales"])
     # Writers that store opacity as a byte make 0 and 255 infinite logits.
     rows["opacities"] = finite_logits(rows["opacities"])
-    if _FILTER in header.properties:
-        log.info("%s: %s, the filter of Mip-Splatting, becomes part of scales and opacities", path, _FILTER)
-        widths = np.concatenate([*read_ply_columns(path, header, [_FILTER])])
+    if "filter_3D" in header.properties:
+        log.info("%s: filter_3D, the widths of Mip-Splatting, become part of scales and opacities", path)
+        widths = np.concatenate([*read_ply_columns(path, header, ["filter_3D"])])
         wider = np.log(np.hypot(np.exp(rows["scales"]), widths))
         kept = np.exp((rows["scales"] - wider).sum(1, keepdims=True))
         rows |= {"scales": wider, "opacities": logits_of(kept * opacity_of(rows["opacities"]))}
@@ -434,16 +432,20 @@ def _by_color(rows: Arrays) -> Arrays:
 def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
     """Write splats as compressed ``.ply``, 16 bytes each and a byte for each SH coefficient, in Morton order.
 
+    Coefficients beyond ±4 are clamped, with a warning.
+
     Returns:
         Bytes of the file.
     """
     scene = scene.in_morton_order()
-    parts = [_packed_part(part) for part in scene.parts()]
+    clamped = Clamped()
+    parts = [_packed_part(part, clamped) for part in scene.parts()]
+    clamped.warn(path, len(scene))
     tables = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return write_elements(path, tables, scene.antialiased)
 
 
-def _packed_part(scene: CompressedScene) -> dict[str, NDArray[np.void]]:
+def _packed_part(scene: CompressedScene, clamped: Clamped) -> dict[str, NDArray[np.void]]:
     """The elements of a part that begins with a chunk."""
     colors = np.asarray(0.5 + SH_C0 * scene.rows("sh0"), np.float32)
     values = np.stack([scene.means, scene.rows("scales").clip(-20, 20), colors], axis=1)
@@ -465,7 +467,8 @@ def _packed_part(scene: CompressedScene) -> dict[str, NDArray[np.void]]:
     words["packed_rotation"] |= dropped.astype(np.uint32) << 30
     tables = {"chunk": dict(zip(_BOUNDS, bounds.reshape(len(starts), -1).T, strict=True)), "vertex": words}
     if scene.sh_degree:
-        levels = np.clip(32 * _by_color(scene.rows("shN")) + 128, 0, 255).astype(np.uint8)
+        levels = np.floor(32 * _by_color(scene.rows("shN")) + 128)
+        levels = clamped.nearest("shN", levels, (0, 255)).astype(np.uint8)
         tables["sh"] = dict(zip(splat_columns(scene.sh_degree)["shN"], levels.T, strict=True))
     return {
         name: np.rec.fromarrays([*table.values()], [(column, values.dtype) for column, values in table.items()])

@@ -19,7 +19,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
 from nsvq_lightning.data.scene import Scene
-from nsvq_lightning.io.atomic import atomic_write, make_folder_of
+from nsvq_lightning.io.atomic import make_folder_of, write_bytes
 from nsvq_lightning.io.errors import FormatError, Json
 from nsvq_lightning.splats.splats import sh_degree_of
 from nsvq_lightning.training.schedule import Schedule
@@ -228,8 +228,7 @@ class PlainCheckpointIO(TorchCheckpointIO):
         content = BytesIO()  # straight into the file, torch would hide that a disk is full
         torch.save(checkpoint, content)
         make_folder_of(Path(path))
-        with atomic_write(path) as file:
-            file.write(content.getbuffer())
+        write_bytes(path, content.getvalue())
 
     def load_checkpoint(self, path: str | Path, map_location: Any = None, weights_only: bool | None = None) -> Any:
         """Read a checkpoint; remote ones as Lightning does, but also refusing anything that could run code.

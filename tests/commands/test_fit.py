@@ -12,7 +12,7 @@ import torch
 import yaml
 from small_demo import write_small_demo
 
-from nsvq_lightning.commands.fit import SplatCLI
+from nsvq_lightning.commands.fit import SplatCLI, summary
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.training.module import SplatModule
@@ -54,6 +54,8 @@ def test_a_run_leaves_scene_report_config_and_checkpoint(finished: Path) -> None
     assert metrics["level"] == "compact"
     assert metrics["paper_level"]["file_bytes"] > metrics["file_bytes"]
     assert [end["phase"] for end in metrics["phases"]] == [phase.name.lower() for phase in Phase]
+    assert f"look at it: open {finished / 'viewer.html'}, or nsvq view" in summary(finished, metrics)
+    assert f"look at it: nsvq view {finished.parent}" in summary(finished.parent, metrics)  # without a page
 
 
 @pytest.mark.parametrize(

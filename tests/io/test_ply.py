@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from compressed_scenes import arrays_of, scene_of
 
-from nsvq_lightning.io import CompressedScene, FormatError, read_ply, read_scene, write_ply
+from nsvq_lightning.io import CompressedScene, FormatError, read_ply, read_scene, save, write_ply
 from nsvq_lightning.io.ply import plain_ply_bytes
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
 
@@ -246,6 +246,18 @@ def test_the_filter_of_mip_splatting_becomes_part_of_the_splats(tmp_path: Path) 
     opacities = 1 / (1 + np.exp(-splats.opacities.astype(float)))
     expected = opacities * (sizes / wider).prod(1)
     assert np.allclose(1 / (1 + np.exp(-found.opacities.astype(float))), expected, rtol=1e-4)
+
+
+def test_harmonics_beyond_what_a_compressed_file_holds_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    splats = scene(5)
+    splats.raw["shN"][:] = np.linspace(-3.9, 3.9, 225).reshape(5, 45)
+    save(splats, tmp_path / "a.compressed.ply")
+    assert not caplog.text
+    splats.raw["shN"][2:4, 7] = 4.1, -19
+    save(splats, tmp_path / "a.compressed.ply")
+    assert "clamped to it: shN 2 (of 5 splats)" in caplog.text
 
 
 @pytest.mark.parametrize(("kind", "full"), [("u1", 255), ("u2", 65535), ("u2", 255), ("f4", 1), ("f4", 255), ("f8", 1)])
