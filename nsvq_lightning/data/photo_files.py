@@ -14,6 +14,9 @@ log = logging.getLogger(__name__)
 # Suffixes of photos that both COLMAP and this package read.
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
+# What names of folders of masks have in them.
+_OF_MASKS = re.compile("(?<!un)mask", re.IGNORECASE)
+
 
 def locate(
     names: Sequence[str], folder: Path, source: str, allow_outside: bool = False, others: Iterable[Path] = ()
@@ -118,10 +121,6 @@ def _kind(name: str) -> str:
 def photos_below(folder: Path) -> list[Path]:
     """The files in a folder and the folders in it that end as photos do, sorted."""
     return sorted(path for path in folder.rglob("*") if path.suffix.lower() in PHOTOS and path.is_file())
-
-
-# What tells folders of masks.
-_OF_MASKS = re.compile("(?<!un)mask", re.IGNORECASE)
 
 
 def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]) -> tuple[Path, int]:
