@@ -234,6 +234,8 @@ def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> Colm
         raise SceneError(f"{files[-1]}: {min(train & test)} is a train and a test photo: list it once")
     is_split = bool(train and test)
     names = sorted(train | test if is_split else frames)
+    if len(names) < len(frames):
+        log.info("%s: %d of %d photos are not used, by its lists", files[0], len(frames) - len(names), len(frames))
     tops = {PurePosixPath(name).parts[0] if "/" in name else "." for name in names}
     folder = tops.pop() if len(tops) == 1 else "."
     numbers: dict[_Lens, int] = {}

@@ -153,13 +153,17 @@ def test_blender_scenes_have_their_own_split_and_random_points(
     assert load_scene(root).split == "every 8th by name"
 
 
-def test_lists_of_train_and_test_photos_are_followed(make_scene: SceneFactory, tmp_path: Path) -> None:
+def test_lists_of_train_and_test_photos_are_followed(
+    make_scene: SceneFactory, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", logger="nsvq_lightning")
     root = write_pinhole(make_scene(), tmp_path / "json")
     lists = {"train_filenames": [f"images/00{i}.png" for i in (0, 1, 2, 5)], "val_filenames": ["images/003.png"]}
     change(root / "transforms.json", **lists)
     scene = load_scene(root)
     assert scene.names == ("000.png", "001.png", "002.png", "003.png", "005.png")
     assert (scene.test, scene.train) == ((3,), (0, 1, 2, 4))
+    assert "4 of 9 photos are not used, by its lists" in caplog.text
     change(root / "transforms.json", val_filenames=["images/001.png"])
     with pytest.raises(SceneError, match=r"001\.png is a train and a test photo"):
         load_scene(root)
