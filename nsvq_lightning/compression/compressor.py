@@ -31,7 +31,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.sampling import trained_by
 from nsvq_lightning.report.numbers import evaluate
 from nsvq_lightning.splats import attributes
-from nsvq_lightning.splats.splats import Splats, SplatTensors, detached
+from nsvq_lightning.splats.splats import Splats, SplatTensors
 from nsvq_lightning.training import importance
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
@@ -439,10 +439,6 @@ class Compressor:
         return int(min(60 * self.minutes / seconds, 1e9))
 
 
-# What nerfstudio calls the coefficients of colours.
-NERFSTUDIO = {"features_dc": "sh0", "features_rest": "shN"}
-
-
 @torch.inference_mode(False)
 def compress(
     splats: CompressedScene | SplatTensors | Mapping[str, Tensor] | ParameterDict,
@@ -477,19 +473,7 @@ def compress(
         ValueError: The splats are empty or not finite, cameras do not show them, photos do not fit the cameras, or a
             limit cannot be met; another background.
     """
-    if isinstance(splats, CompressedScene):
-        scene = splats
-    else:
-        named = splats if isinstance(splats, Mapping | ParameterDict) else detached(splats)._asdict()
-        # Also of arrays and bfloat16.
-        rows = {
-            NERFSTUDIO.get(name, name): torch.as_tensor(values).detach().cpu().float().numpy()
-            for name, values in named.items()
-        }
-        if missing := set(attributes.ATTRIBUTES) - {"shN"} - rows.keys():
-            raise ValueError(f"the splats have no {', '.join(sorted(missing))}")
-        scene = CompressedScene.from_rows(rows, antialiased)
-    scene = scene.finite()
+    scene = CompressedScene.from_splats(splats, antialiased=antialiased).finite()
     if background == "white":
         scene = on_white(scene)
     elif background != "black":

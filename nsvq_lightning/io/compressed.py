@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -17,11 +17,18 @@ from nsvq_lightning.splats import attributes as splat
 from nsvq_lightning.splats.conventions import Arrays, Bools, Float32s, Float64s, Integers, shN_degree, unit
 
 if TYPE_CHECKING:
+    from torch.nn import ParameterDict
+
     from nsvq_lightning.rendering.camera import Camera
     from nsvq_lightning.rendering.rasterize import Render
     from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors
 
+    AnySplats: TypeAlias = "CompressedScene | SplatTensors | Mapping[str, Any] | ParameterDict"
+
 log = logging.getLogger(__name__)
+
+# What nerfstudio calls the coefficients of colours.
+NERFSTUDIO = {"features_dc": "sh0", "features_rest": "shN"}
 
 
 def slices(count: int) -> "Iterator[slice]":
@@ -100,23 +107,31 @@ class CompressedScene:
             raise ValueError(f"cameras must be at most {MAX_CAMERAS} finite positions and focal lengths above 0")
 
     @classmethod
-    def from_splats(cls, splats: "SplatTensors | CompressedScene", **header: Any) -> "CompressedScene":
+    def from_splats(cls, splats: "AnySplats", **header: Any) -> "CompressedScene":
         """A copy of splats, on any device, without any codebook: valid, but not compressed.
 
         Args:
-            splats: The splats; a compressed scene is returned as it is.
-            header: ``config``, ``metrics`` and ``origin``.
+            splats: The splats, or their attributes by their names here or in nerfstudio, tensors or arrays of any
+                numbers; a compressed scene is returned as it is.
+            header: ``antialiased``, ``metrics`` and ``origin``; or ``config``.
 
         Raises:
-            ValueError: The shape of an attribute does not fit the others.
+            ValueError: The shape of an attribute does not fit the others, or one is missing.
         """
-        from nsvq_lightning.splats.splats import check_shapes, detached
+        import torch
+
+        from nsvq_lightning.splats.splats import detached
 
         if isinstance(splats, CompressedScene):
             return splats
-        tensors = detached(splats)._asdict()
-        check_shapes(tensors)
-        return cls.from_rows({name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}, **header)
+        named = splats if isinstance(splats, Mapping | torch.nn.ParameterDict) else detached(splats)._asdict()
+        rows = {
+            NERFSTUDIO.get(name, name): torch.as_tensor(values).detach().cpu().float().numpy().copy()
+            for name, values in named.items()
+        }
+        if missing := set(splat.ATTRIBUTES) - {"shN"} - rows.keys():
+            raise ValueError(f"the splats have no {', '.join(sorted(missing))}")
+        return cls.from_rows(rows, **header)
 
     @classmethod
     def from_rows(cls, rows: Mapping[str, Arrays], antialiased: bool = False, **header: Any) -> "CompressedScene":

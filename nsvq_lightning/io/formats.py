@@ -17,7 +17,8 @@ from nsvq_lightning.io.nsvq.header import describe_nsvq
 from nsvq_lightning.io.nsvq.precision import Storage
 
 if TYPE_CHECKING:
-    from nsvq_lightning.splats.splats import Splats, SplatTensors
+    from nsvq_lightning.io.compressed import AnySplats
+    from nsvq_lightning.splats.splats import Splats
 
 logger = logging.getLogger(__name__)
 
@@ -71,11 +72,12 @@ def read_scene(path: StrPath) -> CompressedScene:
     return replace(kept, stored_bytes=scene.stored_bytes or path.stat().st_size)
 
 
-def save(scene: "SplatTensors | CompressedScene", path: StrPath, storage: Storage | None = None, **options: Any) -> int:
+def save(scene: "AnySplats", path: StrPath, storage: Storage | None = None, **options: Any) -> int:
     """Save a scene in any supported format; splats with NaN or infinite values are left out with a warning.
 
     Args:
-        scene: For example :class:`nsvq_lightning.Splats`. A :class:`CompressedScene` keeps its codebooks where the
+        scene: For example :class:`nsvq_lightning.Splats`, or a dictionary of what gsplat or nerfstudio have, see
+            :meth:`CompressedScene.from_splats`. A :class:`CompressedScene` keeps its codebooks where the
             format has them: all of them in ``.nsvq``, that of the spherical harmonics in ``.sog``.
         path: File to write, replaced atomically; its suffix selects the format.
         storage: Level and precision of ``.nsvq``. For another format, the file then holds what the ``.nsvq`` file

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +26,21 @@ def test_save_then_load_is_exact_whatever_the_case_of_the_suffix(tmp_path: Path,
     assert save(splats, path, Storage("paper")) == path.stat().st_size
     back = load(str(path))
     assert all(torch.equal(getattr(back, name), values) for name, values in splats.attributes().items())
+
+
+def test_attributes_by_name_are_saved_as_they_come(tmp_path: Path) -> None:
+    """As gsplat and nerfstudio have them, some as arrays, in other precisions, and with another shape of opacities."""
+    splats = scene(7, 2)
+    named: dict[str, Any] = {name: values.detach() for name, values in splats.attributes().items()}
+    named |= {"means": named["means"].double().numpy(), "opacities": named["opacities"][:, None]}
+    named |= {"features_dc": named.pop("sh0").squeeze(1), "features_rest": named.pop("shN").bfloat16()}
+    save(named, tmp_path / "a.ply")
+    found = load(tmp_path / "a.ply")
+    for name, values in splats.attributes().items():
+        assert torch.equal(getattr(found, name), values.bfloat16().float() if name == "shN" else values)
+    del named["scales"]
+    with pytest.raises(ValueError, match="the splats have no scales"):
+        save(named, tmp_path / "a.ply")
 
 
 def test_options_reach_the_format(tmp_path: Path) -> None:
