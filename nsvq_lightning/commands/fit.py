@@ -72,9 +72,10 @@ class RunStart(SaveConfigCallback):
             if self.by_minutes:  # the iterations that were chosen, so that the run can be repeated
                 self.config["trainer.max_steps"] = trainer.max_steps
                 phases.minutes = phases.iterations_per_photo = None
-            root = self.config.get("data.init_args.root")
-            if isinstance(root, str):  # so that it is found from any folder
-                self.config["data.init_args.root"] = os.path.abspath(root)
+            for option in ("data.init_args.root", "model.init_from"):
+                given = self.config.get(option)
+                if isinstance(given, str):  # so that it is found from any folder
+                    self.config[option] = os.path.abspath(given)
             self._write(folder)
 
     def on_train_end(self, trainer: Trainer, pl_module: SplatModule) -> None:  # type: ignore[override]

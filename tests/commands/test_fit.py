@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,11 @@ import pytest
 import torch
 import yaml
 from small_demo import write_small_demo
+from splat_scenes import random_splats
 
 from nsvq_lightning.commands.fit import SplatCLI, summary
 from nsvq_lightning.commands.main import main
+from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
@@ -320,12 +323,15 @@ def test_a_run_without_checkpoints_or_bar_leaves_none(
 ) -> None:
     monkeypatch.chdir(demo_scene.parent)
     demo_scene = Path(demo_scene.name)
-    assert main(fit(demo_scene, tmp_path, *CODES, "--trainer.enable_checkpointing=false", steps=3)) == 0
+    save(random_splats(300, sh_degree=1), tmp_path / "start.ply")
+    start = f"--model.init_from={os.path.relpath(tmp_path / 'start.ply')}"
+    assert main(fit(demo_scene, tmp_path, *CODES, start, "--trainer.enable_checkpointing=false", steps=3)) == 0
     folder = tmp_path / demo_scene.name / "version_0"
     assert (folder / "scene.nsvq").is_file()
     assert not (folder / "checkpoints").exists()
     config = yaml.safe_load((folder / "config.yaml").read_text())
     assert config["data"]["init_args"]["root"] == str(demo_scene.resolve())  # whatever folder it is read from
+    assert config["model"]["init_from"] == str(tmp_path / "start.ply")
 
 
 def test_a_quantizer_of_the_current_folder_trains(
