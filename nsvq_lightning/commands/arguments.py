@@ -129,23 +129,6 @@ def scene_file(path: Path) -> Path:
     return path
 
 
-def photos_of(path: Path) -> Path | None:
-    """Folder of the photos that a scene was trained on, as the run that it lies in says; None if nothing says it.
-
-    Raises:
-        ValueError: Beside it is a ``config.yaml`` that is no table of settings.
-    """
-    root = _settings_of_run(path).get("data.root")
-    if not root:
-        return None
-    folder = Path(root).expanduser()
-    return folder if folder.is_dir() else None
-
-
-def _settings_of_run(path: Path) -> dict[str, str]:
-    return values_by_name(settings_of([str(_run_of(path) / "config.yaml")]))
-
-
 def _run_of(path: Path) -> Path:
     """The folder of a run, given that or a scene file in it."""
     return path if path.is_dir() else path.parent
@@ -169,10 +152,14 @@ def _found_views(path: Path, root: Path | None) -> "Views":
     from nsvq_lightning.rendering.camera_paths import CAMERAS, read_cameras
     from nsvq_lightning.report.viewer import page_cameras
 
-    folder = root or photos_of(path)
     run = _run_of(path).resolve()
+    settings = {} if root else values_by_name(settings_of([str(_run_of(path) / "config.yaml")]))
+    folder = root
+    if given := settings.get("data.root"):
+        folder = Path(given).expanduser()
+        if not folder.is_dir():
+            folder = None
     if folder is not None and (has_poses(folder) or not (folder / CAMERAS).is_file()):
-        settings = {} if root else _settings_of_run(path)
         texts = settings.get("data.factor", ""), settings.get("data.max_width", "1600")
         size = [int(text) if text.isdigit() else None for text in texts]
         try:
@@ -292,6 +279,6 @@ def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -
     from nsvq_lightning.compression.viewpoints import square_views
     from nsvq_lightning.data.scene import spread
 
-    cameras, photos = known_views(path, root, splats.means.detach().cpu().numpy())
+    cameras, photos = known_views(path, root, splats.means.detach().numpy())
     known = list(cameras.values()) if photos is None else photos.train_cameras
     return spread(known, most) or square_views(splats, most)

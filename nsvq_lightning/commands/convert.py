@@ -88,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
     say(f"{output}: {len(scene):,} splats in {size:,} bytes, {size / len(scene):.1f} per splat")
     if entry.in_order is not None:  # the format is not exact
-        errors = attribute_errors(formats.read_scene(output), entry.in_order(scene))
+        errors = attribute_errors(formats.read_scene(output), scene)
         listed = ", ".join(f"{name} {error:.2g}{'°' * (name == 'rotation')}" for name, error in errors.items())
         say(f"  root mean square errors: {listed}")
     if options.measure:

@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
 
 def shown(findings: "Iterator[Finding]") -> Counter[str]:
     """Print findings as they come, since each check takes seconds; returns how many there are of each verdict."""
-    counts: Counter[str] = Counter()
+    counts = Counter[str]()
     for finding in findings:
         say(str(finding))
         counts[finding.verdict] += 1
@@ -199,7 +199,7 @@ def check_model(root: Path) -> Iterator[Finding]:
     from nsvq_lightning.data.transforms import read_poses
 
     model = read_poses(root, observations=True)
-    if model.source == "COLMAP" and (larger := larger_models(root)) is not None:
+    if model.source == "COLMAP" and (larger := larger_models(root)):
         yield Finding("problem", "model", larger)
     yield from attempt("cameras", check_cameras(model))
     yield from attempt("points", check_points(model))
@@ -236,7 +236,7 @@ def check_points(model: "ColmapModel") -> Iterator[Finding]:
         program = "COLMAP" if model.source == "COLMAP" else "the export"
         yield Finding("problem", "points", f"none is finite: run {program} again")
         return
-    far = float(astray(finite, 10).mean())
+    far = astray(finite, 10).mean()
     text = f"{count:,}, {100 * far:.2g} % far outliers"
     if len(finite) < count:
         text += f", {count - len(finite)} not finite (left out)"
@@ -291,7 +291,7 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
     if not scene.extent > 0:
         yield Finding("problem", "extent", f"all train photos {ONE_PLACE}")
     if (seen := model.observations) is not None:
-        points = model.points - np.array(scene.frame.origin)
+        points = model.points - scene.frame.origin
         shown = sum(
             np.count_nonzero(in_picture(points[seen[seen[:, 1] == row, 0]], camera))
             for row, camera in enumerate(scene.cameras)

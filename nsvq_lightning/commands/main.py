@@ -229,7 +229,7 @@ def _is_ours(error: BaseException) -> bool:
     if not isinstance(error, ValueError | TypeError | OSError | RuntimeError | ArithmeticError | ImportError):
         return False
     modules = [str(frame.f_globals.get("__name__")) for frame, _ in walk_tb(error.__traceback__)]
-    return bool(modules) and modules[-1].startswith("nsvq_lightning.")
+    return modules[-1].startswith("nsvq_lightning.")
 
 
 class BarHandler(logging.StreamHandler[TextIO]):

@@ -19,7 +19,7 @@ BUDGET = "--callbacks.budget"
 
 # Short options of ``fit``. The first three are numbers of :class:`nsvq_lightning.callbacks.SplatBudget`, of which one
 # holds.
-SHORTHANDS: dict[str, str] = {
+SHORTHANDS = {
     "quality": "Splats, as a multiple of the default for the photos; more look better and take more bytes and time",
     "splats": "Splats of the scene, instead of --quality",
     "bytes": "Size of the file, instead of --quality",

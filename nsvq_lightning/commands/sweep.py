@@ -396,5 +396,5 @@ def difference(rows: Sequence[Row], first: Sequence[Row]) -> str:
     if len(found) == 1:
         return f"{found[0]:+.2f}, one seed"
     mean, error = np.mean(found), stats.sem(found)
-    noise = abs(mean) <= error * stats.t.isf(CHANCE / 2, len(found) - 1)
+    noise = not stats.ttest_1samp(found, 0).pvalue < CHANCE  # NaN where all are 0
     return f"{mean:+.3f} ± {error:.3f}{', noise' * bool(noise)}"

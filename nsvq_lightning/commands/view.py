@@ -92,13 +92,10 @@ def run(options: argparse.Namespace) -> int:
 def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
     """The scene that is meant, as a ``.nsvq`` file; that of a running fit is yet to come."""
     from nsvq_lightning.io.formats import save
-    from nsvq_lightning.io.nsvq.header import read_header
     from nsvq_lightning.io.nsvq.precision import Storage
 
     file = options.scene / "scene.nsvq" if options.live else scene_file(options.scene)
     if file.suffix.lower() == ".nsvq":
-        if not options.live:
-            read_header(file)  # verifies the checksum
         yield file
         return
     with tempfile.TemporaryDirectory() as folder:

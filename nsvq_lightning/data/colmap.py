@@ -376,7 +376,7 @@ def rgb_bytes(values: Float64s, floats: bool = False) -> Uint8s:
 
 
 def alignment(model: ColmapModel, other: ColmapModel) -> Float64s:
-    """The similarity ``[4, 4]`` that takes the camera centres of a model nearest to those of another, by photo name.
+    """The similarity ``[3, 4]`` that takes the camera centres of a model nearest to those of another, by photo name.
 
     Raises:
         SceneError: They share fewer than three photos, or these lie on a line, and so do not say how it turns.
@@ -390,7 +390,7 @@ def alignment(model: ColmapModel, other: ColmapModel) -> Float64s:
                 f"{len(shared)} photos of the same name are in both scenes: to align them takes three that were not "
                 "taken from one line"
             )
-    return np.vstack([import_pycolmap().estimate_sim3d(ours, theirs).matrix(), (0, 0, 0, 1)])
+    return np.asarray(import_pycolmap().estimate_sim3d(ours, theirs).matrix())
 
 
 def _no_model(root: Path, folders: Sequence[str], chosen: str | None) -> SceneError:

@@ -185,13 +185,13 @@ def _image_record(data: mmap.mmap, start: int) -> tuple[ImageRow, int]:
         raise struct.error("its name does not end")
     name = data[start + _IMAGE.size : end].decode(errors="surrogateescape")
     (points,) = _U64.unpack_from(data, end + 1)
-    return ImageRow(number, tuple(pose), camera_id, name), end + 1 + _U64.size + 24 * int(points)
+    return ImageRow(number, tuple(pose), camera_id, name), end + 1 + _U64.size + 24 * points
 
 
 def _point_record(data: mmap.mmap, start: int, tracks: bool) -> tuple[_Point, int]:
     *values, _, length = _POINT.unpack_from(data, start)
     first = start + _POINT.size
-    end = first + 8 * int(length)
+    end = first + 8 * length
     if end > len(data) or not tracks:
         return tuple(values), end
     images = struct.unpack_from(f"<{2 * length}I", data, first)[::2]

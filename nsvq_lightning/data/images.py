@@ -46,16 +46,16 @@ def image_head(path: Path) -> ImageHead:
     """
     try:
         with PIL.Image.open(path) as image:
-            width, height = image.size
+            size = image.size
             # Pillow decodes a whole PNG to look for a tag that is hardly ever there.
             tags = {} if image.format == "PNG" else image.getexif()
             orientation = int(tags.get(Base.Orientation, 1))
             if image.format == "TIFF":  # Pillow applies the orientation to their size
-                width, height = int(tags[Base.ImageWidth]), int(tags[Base.ImageLength])
+                size = int(tags[Base.ImageWidth]), int(tags[Base.ImageLength])
             has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
     except DAMAGED as error:
         raise _undecodable(path, str(error)) from error
-    return ImageHead((width, height), orientation, has_alpha)
+    return ImageHead(size, orientation, has_alpha)
 
 
 # Relative difference of aspect ratios that rounding explains.
@@ -220,7 +220,7 @@ class Picture(NamedTuple):
     @property
     def nbytes(self) -> int:
         """Bytes in memory."""
-        return self.image.nbytes + (0 if self.mask is None else self.mask.nbytes)
+        return sum(each.nbytes for each in self if each is not None)
 
 
 @dataclass(frozen=True, eq=False)

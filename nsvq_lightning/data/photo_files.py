@@ -81,7 +81,7 @@ class _Files:
 
     def __init__(self, folder: Path, paths: Iterable[Path], whole: bool = True) -> None:
         self._whole = whole
-        self._found: defaultdict[str, list[Path]] = defaultdict(list)
+        self._found = defaultdict[str, list[Path]](list)
         for path in paths:
             for key in self._keys(path.relative_to(folder).as_posix()):
                 self._found[key].append(path)

@@ -308,7 +308,7 @@ def _map(scene: Path, stamps: dict[str, str], report: Report, threads: int) -> l
 def _adding(models: Iterable[Any]) -> list[Any]:
     """The largest model, and those with photos that no larger one has; COLMAP also leaves parts of larger ones."""
     adding = []
-    placed: set[str] = set()
+    placed = set[str]()
     for model in sorted(models, key=lambda model: -model.num_reg_images()):
         names = _registered(model)
         if not names <= placed:
@@ -449,7 +449,7 @@ def _converted(image: PIL.Image.Image, path: Path, kind: str) -> bytes:
     upright = PIL.ImageOps.exif_transpose(image)
     colours = upright.convert("RGBA" if upright.has_transparency_data else "RGB")
     file = io.BytesIO()
-    colours.save(file, kind, quality=JPEG_QUALITY, exif=upright.getexif().tobytes())
+    colours.save(file, kind, quality=JPEG_QUALITY, exif=upright.getexif())
     return file.getvalue()
 
 

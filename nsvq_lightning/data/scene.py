@@ -197,7 +197,7 @@ def load_scene(
         raise ValueError(f"test_every must be at least 2 (1 leaves no train view), got {test_every}")
     root = Path(root).expanduser()
     poses = read_poses(root, model, allow_outside=allow_outside)
-    if model is None and poses.source == "COLMAP" and (larger := larger_models(root)) is not None:
+    if model is None and poses.source == "COLMAP" and (larger := larger_models(root)):
         log.warning("%s: %s", root, larger)
     views = range(len(poses.images))
     test = tuple(views[::test_every])
@@ -308,7 +308,7 @@ def load_cameras(root: str | Path, factor: Factor | None = None, max_width: int 
     Raises:
         SceneError: There is no model, or it is damaged; or it does not say how large the photos are.
     """
-    root = Path(root).expanduser()
+    root = Path(root)
     poses, frame = _framed(read_poses(root, allow_outside=True), root)
     lenses = {}
     for number, lens in poses.cameras.items():

@@ -47,7 +47,8 @@ def atomic_path(path: StrPath) -> Iterator[Path]:
         os.replace(temporary, target)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename in (None, str(temporary)):  # as of a full disk
+        # That of a full disk does not say which file, or names this one.
+        if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
             error.filename = str(path)
         raise
     # Make the new name itself survive a power failure, where the system can open folders.

@@ -222,7 +222,6 @@ class CompressedScene:
 
     def rows(self, name: str) -> Float32s:
         """An attribute ``[N, D]``, bit for bit the rows of its codebook if it has one; positions without ``origin``."""
-        rows: Float32s
         if name in self.codes:
             rows = self.codebooks[name][self.codes[name]]
         else:
@@ -290,8 +289,7 @@ class CompressedScene:
         """Which splats ``[N]`` have neither NaN nor infinite values, and how many do, by attribute."""
         found: dict[str, Any] = {"means": self.means, "opacities": self.opacities, **self.raw}
         for name, codes in self.codes.items():
-            row_is_finite = np.isfinite(self.codebooks[name]).all(1)
-            found[name] = np.where(row_is_finite, np.float32(0), np.float32(np.nan))[codes]
+            found[name] = np.where(np.isfinite(self.codebooks[name]).all(1), 0, np.nan)[codes]
         return splat.finite_rows(found)
 
     def relative_to(self, origin: tuple[float, float, float]) -> "CompressedScene":
@@ -382,7 +380,7 @@ def _check_codes(name: str, codes: Integers, codebook: Float32s, n: int, dim: in
         raise TypeError(f"codes[{name!r}] must be integers, got {codes.dtype}")
     if rows == 0:
         raise ValueError(f"codebooks[{name!r}] is empty; a codebook needs at least one row")
-    if n and not (int(codes.min()) >= 0 and int(codes.max()) < rows):
+    if n and not (codes.min() >= 0 and codes.max() < rows):
         raise ValueError(f"codes[{name!r}] must be in 0..{rows - 1}, got {codes.min()}..{codes.max()}")
 
 

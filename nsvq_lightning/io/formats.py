@@ -161,7 +161,7 @@ _WAYS = {
     ".gltf": "save it as .glb",
 }
 # Formats by the end of the file's name; a new format is one more entry.
-FORMATS: dict[str, Format] = {
+FORMATS = {
     ".ply": Format("3D Gaussian Splatting", ply.read_ply, ply.write_ply),
     ".nsvq": Format("compressed scene of this package", read_nsvq, write_nsvq, native=True),
     ".sog": Format("PlayCanvas, SuperSplat", sog.read_sog, sog.write_sog, in_order=CompressedScene.in_morton_order),

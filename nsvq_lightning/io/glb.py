@@ -47,7 +47,7 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
         Bytes of the file.
     """
     scene = rotated(scene, HALF_TURN)
-    opacities = opacity_of(scene.opacities)
+    opacities = opacity_of(scene.rows("opacities"))
     base, higher = scene.rows("sh0"), scene.values("shN")
     # The fallback is linear light; what the splats have is meant for display.
     shown = np.clip(0.5 + SH_C0 * base.astype(np.float64), 0, 1)
@@ -57,7 +57,7 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
         "COLOR_0": np.rint(255 * np.c_[linear, opacities]).astype(np.uint8),
         f"{EXTENSION}:ROTATION": unit(scene.rows("quats"))[:, [1, 2, 3, 0]].astype(np.float32),
         f"{EXTENSION}:SCALE": np.exp(scene.rows("scales")),
-        OPACITY: opacities.astype(np.float32)[:, None],
+        OPACITY: opacities.astype(np.float32),
         _harmonic(0): base,
         **{_harmonic(number + 1): higher[:, number] for number in range(higher.shape[1])},
     }
@@ -217,7 +217,7 @@ def _splats(document: Json, data: memoryview, primitive: Json) -> CompressedScen
     if _harmonic(0) in names:
         rows["sh0"] = values(_harmonic(0))
     else:
-        rows["sh0"] = (values("COLOR_0")[:, :3] - 0.5) / np.float32(SH_C0)
+        rows["sh0"] = (values("COLOR_0")[:, :3] - 0.5) / SH_C0
     if degree:
         higher = [values(_harmonic(number + 1)) for number in range(sh_coefficients(degree))]
         rows["shN"] = np.concatenate(higher, axis=1)
@@ -254,5 +254,5 @@ def _accessor(document: Json, data: memoryview, number: int) -> Float32s:
         raise FormatError(f"truncated: accessor {number} ends beyond the file")
     rows = np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize)).astype(np.float32)
     if dtype.kind != "f" and accessor.get("normalized"):
-        rows = np.maximum(rows / np.float32(np.iinfo(dtype).max), np.float32(-1))
+        rows = np.maximum(rows / np.iinfo(dtype).max, -1)
     return rows

@@ -111,7 +111,7 @@ def _tree(levels: Sequence[CompressedScene]) -> tuple[Json, list[tuple[list[Inte
         low, high = boxes[splats, 0].min(0), boxes[splats, 1].max(0)
         found: Json = {"bound": {"min": _decimals(low), "max": _decimals(high)}}
         finest, *coarser = np.split(splats, np.searchsorted(splats, starts[1:-1]))
-        axis = int(means[finest].std(0).argmax())
+        axis = means[finest].std(0).argmax()
         below = means[splats, axis] < np.median(means[finest, axis])
         if len(finest) > LEAF and below[: len(finest)].any():
             found["children"] = [node(splats[below]), node(splats[~below])]

@@ -54,11 +54,11 @@ class Grid:
             return cls(1.0, (0, 0, 0))
         for far in (0.001, 0.02, 0.25):
             low, high = np.quantile(means.astype(np.float64), (far, 1 - far), axis=0)
-            extent = max(float((high - low).max()), float(np.abs([low, high]).max()) * 2.0**-40, 1e-30)
+            extent = max((high - low).max(), np.abs([low, high]).max() * 2.0**-40, 1e-30)
             finest = power_above(extent * 2.0 ** (1 - AXIS_BITS))  # the scene takes up to half of each side of the grid
             if not 0 < np.median(widest) < finest:
                 break
-        step = power_below(max(float(np.quantile(widest, 0.001)), finest))
+        step = power_below(max(np.quantile(widest, 0.001), finest))
         # Cells up to a quarter of the grid lie on multiples of their own width, whichever scene it was made for.
         quarter = 1 << AXIS_BITS - 2
         base = np.rint(((low + high) / 2 / step - 2 * quarter) / quarter).astype(np.int64) * quarter

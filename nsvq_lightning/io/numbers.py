@@ -27,7 +27,7 @@ _OPAQUE = 20.0
 
 def finite_logits(logits: Float32s) -> Float32s:
     """The logits with ±20 in place of ±inf, which 0 and 255 become where opacities are stored as bytes."""
-    return np.where(np.isinf(logits), np.copysign(np.float32(_OPAQUE), logits), logits)
+    return np.where(np.isinf(logits), np.copysign(_OPAQUE, logits), logits)
 
 
 def logits_of(opacities: NDArray[np.floating[Any]]) -> Float32s:
@@ -76,19 +76,19 @@ class Clamped:
 
         Args:
             name: Attribute, for the message.
-            values: Values ``[N, ...]`` in units of the format.
+            values: Values ``[N, D]`` in units of the format.
             ends: Smallest and largest integer of the format.
 
         Returns:
-            Integers ``[N, ...]``.
+            Integers ``[N, D]``.
         """
         rounded = np.clip(np.rint(values), *ends)
         self.count(name, np.abs(rounded - values) > 0.5 + _ROUNDING)
         return np.asarray(np.nan_to_num(rounded), np.int32)
 
     def count(self, name: str, beyond: Bools) -> None:
-        """Count the splats with any values ``[N, ...]`` of an attribute that are beyond its range."""
-        self._counts[name] += int(beyond.any(tuple(range(1, beyond.ndim))).sum())
+        """Count the splats with any values ``[N, D]`` of an attribute that are beyond its range."""
+        self._counts[name] += beyond.any(1).sum()
 
     def warn(self, path: StrPath, count: int) -> None:
         """Warn how many of ``count`` splats were clamped to the format's range."""
@@ -110,8 +110,7 @@ def power_above(value: float) -> float:
 
 def nearest_power(value: float) -> float:
     """The power of two whose ratio to a positive ``value`` is between √½ and √2."""
-    below = power_below(value)
-    return below if value / below <= math.sqrt(2.0) else 2 * below
+    return power_above(value / math.sqrt(2.0))
 
 
 def coarsest_power(values: Float32s) -> float:

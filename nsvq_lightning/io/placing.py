@@ -63,7 +63,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     from nsvq_lightning.rendering.sh import sh_rotation
 
     linear, shift = matrix[:3, :3], matrix[:3, 3]
-    size = float(np.cbrt(np.linalg.det(linear)))
+    size = np.cbrt(np.linalg.det(linear))
     if not (
         np.isfinite(matrix).all()
         and size > 0

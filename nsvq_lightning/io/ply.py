@@ -259,9 +259,9 @@ def _coefficients(colors: Float32s, is_float: bool) -> Float32s:
 def _check_packed(header: PlyHeader) -> None:
     chunk = header.others["chunk"]
     sh = header.others.get("sh")
-    expected = [(header, list(_PACKED), "u4"), (chunk, _bounds(chunk), "f4")]
+    expected = [(header, _PACKED, "u4"), (chunk, _bounds(chunk), "f4")]
     if sh:
-        expected.append((sh, list(sh.properties), "u1"))
+        expected.append((sh, sh.properties, "u1"))
     for table, columns, kind in expected:
         for name in columns:
             if name not in table.properties or table.dtype[name].str[1:] != kind:
@@ -418,7 +418,7 @@ def write_ply(path: StrPath, scene: CompressedScene) -> int:
         for part in scene.parts():
             columns = {name: part.rows(name) for name in ATTRIBUTES}
             columns["shN"] = _by_color(columns["shN"])
-            columns["unused"] = np.zeros((len(columns["means"]), len(_UNUSED)), np.float32)
+            columns["unused"] = np.zeros((len(part), len(_UNUSED)), np.float32)
             table = np.concatenate([columns[name] for name in _ORDER], axis=1)
             file.write(table.astype("<f4", copy=False).tobytes())
         return file.tell()
@@ -447,7 +447,7 @@ def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
 
 def _packed_part(scene: CompressedScene, clamped: Clamped) -> dict[str, NDArray[np.void]]:
     """The elements of a part that begins with a chunk."""
-    colors = np.asarray(0.5 + SH_C0 * scene.rows("sh0"), np.float32)
+    colors = 0.5 + SH_C0 * scene.rows("sh0")
     values = np.stack([scene.means, scene.rows("scales").clip(-20, 20), colors], axis=1)
     starts = np.arange(0, len(scene), _CHUNK)
     bounds = np.stack([each.reduceat(values, starts) for each in (np.minimum, np.maximum)], axis=2)

@@ -99,7 +99,7 @@ def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
     for name, picture in pictures.items():
         buffer = io.BytesIO()
         # exact=True: otherwise colours under alpha 0 are changed.
-        Image.fromarray(picture, "RGBA").save(buffer, "WEBP", lossless=True, exact=True, quality=75, method=3)
+        Image.fromarray(picture).save(buffer, "WEBP", lossless=True, exact=True, quality=75, method=3)
         contents[name] = buffer.getvalue()
     return contents
 
@@ -405,11 +405,10 @@ def read_sog(path: StrPath) -> CompressedScene:
         raw = {"quats": archive.quats(), "scales": archive.values("scales", archive.texels("scales")[:, :3])}
         raw["sh0"], opacities = archive.colors()
         codes, codebooks = {}, {}
-        if archive.sh_degree:
+        if degree := archive.sh_degree:
             codebooks["shN"], codes["shN"] = archive.palette()
         else:
             raw["shN"] = np.zeros((archive.count, 0), np.float32)
         antialiased = archive.meta.get("model") == "antialiased" or archive.meta.get("antialias") is True
         config = {"antialiased": True} if antialiased else {}
-        degree = archive.sh_degree
         return CompressedScene(archive.means(), opacities, codes, codebooks, raw, degree, config, stored_bytes=size)

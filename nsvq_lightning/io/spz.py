@@ -352,8 +352,7 @@ def _fraction_bits(scene: CompressedScene) -> int:
     needed = math.ceil(-(math.log2(2 * 0.05) + float(np.quantile(sizes, 0.001)) / math.log(2)))
     reach = np.abs(scene.means).max(1)
     fits, mostly_fits = (_POSITION - 1 - math.frexp(end)[1] for end in (reach.max(), np.quantile(reach, 0.999)))
-    bits = max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0)
-    return min(bits, MAX_FRACTION)
+    return min(max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0), MAX_FRACTION)
 
 
 def _packed(scene: CompressedScene, name: str, factor: float | Float32s, zero: float, clamped: Clamped) -> Uint8s:

@@ -37,7 +37,7 @@ def write_usda(path: StrPath, scene: CompressedScene) -> int:
         "point3f[] positions": (3, [scene.means]),
         "quatf[] orientations": (4, [unit(scene.rows("quats"))]),
         "float3[] scales": (3, [np.exp(scene.rows("scales").astype(np.float64))]),
-        "float[] opacities": (1, [opacity_of(scene.opacities)[:, None]]),
+        "float[] opacities": (1, [opacity_of(scene.rows("opacities"))]),
         f"float3[] {_COEFFICIENTS}": (3, [scene.rows("sh0"), scene.rows("shN")]),
         "float3[] extent": (3, [np.stack([scene.means.min(0), scene.means.max(0)])]),
     }
@@ -110,7 +110,7 @@ def _rows(text: str, name: str, width: int) -> Float32s:
         if found := re.search(rf"\[\]\s*{each}\s*{value}", text):
             numbers = re.sub(r"[(),]", " ", found[1]).split()
             try:
-                return np.array(numbers, np.float64).astype(np.float32).reshape(-1, width)
+                return np.array(numbers, np.float32).reshape(-1, width)
             except ValueError as error:
                 raise FormatError(f"damaged: {name} ({error})") from None
     raise FormatError(f"truncated: {name} has no end" if name in text else f"no attribute {name}")

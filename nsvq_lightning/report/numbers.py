@@ -87,9 +87,9 @@ def summarize(
     file_bytes = path.stat().st_size
     header = read_header(path)
     plain_bytes = plain_ply_bytes(len(scene), scene.sh_degree)
-    last = {str(entry["phase"]): dict(entry) for entry in module.history}  # the last evaluation of each phase
+    last = {entry["phase"]: entry for entry in module.history}  # the last evaluation of each phase
     return {
-        **{name: float(sum(score[name] for score in scores)) / len(scores) for name in scored},
+        **{name: sum(score[name] for score in scores) / len(scores) for name in scored},
         "lpips": lpips[0],
         "lpips_reason": lpips[1],
         "views": len(scores),

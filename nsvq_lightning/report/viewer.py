@@ -104,7 +104,7 @@ def viewer_page(
         connect = " connect-src 'self';"
     scene = {
         "cameras": [{"name": name, **camera_entry(camera)} for name, camera in cameras.items()],
-        "background": list(behind),
+        "background": behind,
         "up": up_of(list(cameras.values())).tolist(),
         "near": min(camera.near for camera in cameras.values()),
         "start": start,

@@ -122,12 +122,11 @@ def dropped(mask: _Array, culprits: Mapping[str, int]) -> str:
     return f"dropped {int((~mask).sum())} of {len(mask)} splats with non-finite values: {listed(culprits)}"
 
 
-_DIMS = attribute_dims(sh_degree=3)
 # The quantized attributes, those with most codes first, and their numbers of codes relative to that for scales (paper,
 # section 4). Positions and opacities are not vector quantized.
 QUANTIZED = {
     name: ATTRIBUTES[name].code_share
-    for name in sorted(QUANTIZABLE, key=lambda name: (-ATTRIBUTES[name].code_share, _DIMS[name]))
+    for name in sorted(QUANTIZABLE, key=lambda name: (-ATTRIBUTES[name].code_share, attribute_dims(3)[name]))
 }
 
 

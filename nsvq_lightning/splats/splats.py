@@ -89,7 +89,6 @@ class Splats(nn.Module):
         super().__init__()
         for name, shape in attribute_shapes(sh_degree).items():
             self.register_parameter(name, nn.Parameter(torch.zeros(0, *shape)))
-        self._tables: list[str] = []
         self.edits = 0
 
     @classmethod
@@ -109,7 +108,7 @@ class Splats(nn.Module):
         Raises:
             ValueError: A shape does not fit the others.
         """
-        tensors = dict(zip(ATTRIBUTES, (means, quats, scales, opacities, sh0, shN), strict=True))
+        tensors = RawSplats(means, quats, scales, opacities, sh0, shN)._asdict()
         check_shapes(tensors)
         splats = cls(sh_degree_of(shN))
         for name, tensor in tensors.items():
@@ -169,14 +168,13 @@ class Splats(nn.Module):
 
     def add_table(self, name: str) -> Tensor:
         """Add (or get) a side table ``[N]`` of zeros that follows the rows through every edit and checkpoint."""
-        if name not in self._tables:
-            self._tables.append(name)
+        if name not in self._buffers:
             self.register_buffer(name, self.means.new_zeros(len(self)))
         return self.get_buffer(name)
 
     def tables(self) -> dict[str, Tensor]:
         """The side tables by name."""
-        return {name: getattr(self, name) for name in self._tables}
+        return dict(self.named_buffers())
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
         """Resize to the stored number of rows before the values are copied."""

@@ -16,7 +16,6 @@ from nsvq_lightning.commands.arguments import (
     integers,
     known_views,
     names,
-    photos_of,
     positive,
     scene_file,
     scene_with_views,
@@ -83,13 +82,15 @@ def test_a_scene_is_a_file_or_that_of_a_run(tmp_path: Path) -> None:
         scene_file(tmp_path / "last.ckpt")
 
 
-def test_a_run_says_where_its_photos_are(tmp_path: Path) -> None:
+def test_a_run_says_where_its_photos_are(tmp_path: Path, demo_scene: Path) -> None:
     config = tmp_path / "config.yaml"
-    for content, photos in (("root: {folder}", tmp_path), ("root: {folder}/gone", None), ("factor: 2", None)):
-        config.write_text("data: {init_args: {" + content.format(folder=tmp_path) + "}}")
-        assert photos_of(tmp_path) == photos_of(tmp_path / "scene.nsvq") == photos
+    for content, known in (("root: {folder}", True), ("root: {folder}/gone", False), ("factor: 2", False)):
+        config.write_text("data: {init_args: {" + content.format(folder=demo_scene) + "}}")
+        for path in (tmp_path, tmp_path / "scene.nsvq"):
+            cameras, photos = known_views(path, None)
+            assert (bool(cameras), photos is not None) == (known, known)
     config.unlink()
-    assert photos_of(tmp_path) is None
+    assert known_views(tmp_path, None) == ({}, None)
 
 
 ENTRY = {"img_name": "a", "width": 8, "height": 6, "fx": 7, "fy": 7, "position": [0, 0, -6]}

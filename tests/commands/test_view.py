@@ -12,7 +12,7 @@ import pytest
 from chromium import chromium, needs_chromium
 from splat_scenes import random_splats
 
-from nsvq_lightning.commands.arguments import photos_of
+from nsvq_lightning.commands.arguments import known_views
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.commands.view import _Handler, _is_own, _Server
 from nsvq_lightning.data.scene import load_scene
@@ -192,7 +192,7 @@ def test_errors_are_one_line(
 @pytest.mark.parametrize("settings", ["data: 3", "data: {init_args: [1]}", "data: {root: 5}", "model: {}"])
 def test_a_config_of_something_else_names_no_photos(settings: str, tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text(settings)
-    assert photos_of(tmp_path / "scene.nsvq") is None
+    assert known_views(tmp_path / "scene.nsvq", None) == ({}, None)
 
 
 def test_a_port_in_use_is_told(

@@ -43,7 +43,7 @@ def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Measu
         error = look(load(path).raw(), workload) - truths[suffix]
         values[name] = {
             "bytes a splat": size / len(splats.means),
-            "bytes": float(size),
+            "bytes": size,
             "image error": float(error.abs().mean()),
         }
     described = f"{workload.name}, {scope.codebooks} codebooks"

@@ -26,6 +26,8 @@ FORWARD = "forward"
 BOTH = "forward + backward"
 LOSS = "L1 + D-SSIM, forward + backward"
 
+BACKGROUND = 0.2, 0.3, 0.4  # RGB
+
 # An image with a graph behind it, and the splats at its other end.
 Traced = tuple[Tensor, RawSplats]
 # Renders splats as the camera of a workload sees them: image ``[H, W, 3]``.
@@ -42,7 +44,7 @@ def run(scope: Scope) -> Iterator[Measurement]:
 
 def painted(backend: str, splats: RawSplats, workload: Workload, sampling: Sampling | None = None) -> Tensor:
     """Render with a back-end; without that argument, it is a :data:`Painter`."""
-    background = workload.background.to(splats.means)
+    background = torch.tensor(BACKGROUND).to(splats.means)
     return render(splats, workload.camera, background=background, backend=backend, sampling=sampling).image
 
 
@@ -95,7 +97,7 @@ def errors_of(crop: Workload, paint: Painter, truth: Traced) -> dict[str, dict[s
     gradients = torch.autograd.grad(*found, weights)
     expected = torch.autograd.grad(*truth, weights.double(), retain_graph=True)
     by_name = dict(zip(RawSplats._fields, map(relative_l2, gradients, expected), strict=True))
-    pixels = {"error pixels": float(crop.camera.width * crop.camera.height)}
+    pixels = {"error pixels": crop.camera.width * crop.camera.height}
     return {FORWARD: {**pixels, **image}, BOTH: {**pixels, "gradient error": max(by_name.values()), **by_name}}
 
 

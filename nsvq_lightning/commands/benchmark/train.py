@@ -199,7 +199,7 @@ def run(scope: Scope) -> Iterator[Measurement]:
             "seconds": sum(samples) / 1000 / rounds,
             "times as shipped": clock.relative / shipped.relative,
             **clock.by_phase,
-            "splats": float(clock.splats),
+            "splats": clock.splats,
         }
         if name.startswith("no skip"):
             values["saves %"] = 100 * (1 - shipped.relative / clock.relative)

@@ -28,14 +28,12 @@ class Workload:
         name: Name in the tables.
         splats: Raw attributes, float32, detached.
         camera: The view.
-        background: RGB ``[3]``.
         image_gradient: Gradient of the image ``[H, W, 3]``.
     """
 
     name: str
     splats: RawSplats
     camera: Camera
-    background: Tensor
     image_gradient: Tensor
 
     def crop(self, width: int, height: int) -> "Workload":
@@ -52,11 +50,10 @@ class Workload:
         return replace(self, camera=replace(self.camera, K=K, width=width, height=height), image_gradient=gradient)
 
     def to(self, device: torch.device | str) -> "Workload":
-        """The workload with its splats, background and gradient on a device; the camera stays where it is."""
+        """The workload with its splats and gradient on a device; the camera stays where it is."""
         return replace(
             self,
             splats=RawSplats(*(tensor.to(device) for tensor in self.splats)),
-            background=self.background.to(device),
             image_gradient=self.image_gradient.to(device),
         )
 
@@ -152,4 +149,4 @@ def _camera(width: int, height: int, target: Float64s, distance: float) -> Camer
 def _seen_by(camera: Camera, splats: RawSplats, name: str) -> Workload:
     shape = camera.height, camera.width, 3
     gradient = _tensor(np.random.default_rng(SEED + 1).normal(size=shape) / math.prod(shape))
-    return Workload(name, splats, camera, torch.tensor((0.2, 0.3, 0.4)), gradient)
+    return Workload(name, splats, camera, gradient)

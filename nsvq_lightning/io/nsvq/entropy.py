@@ -110,7 +110,7 @@ def encode_keys(keys: Uint64s, depths: Int64s) -> bytes:
     check_array("keys", keys, (len(depths),), UINT64)
     if (keys[1:] < keys[:-1]).any() or (len(keys) and keys[-1] > _KEY_MASK):
         raise ValueError(f"keys must ascend and be below 2^{KEY_BITS}, got {keys}; sort them")
-    words = _room(int(depths.sum()) + 8 * len(keys))
+    words = _room(depths.sum() + 8 * len(keys))
     return _bytes(words, _write_keys(keys, depths, words, rc.new_contexts(_KEY_CONTEXTS)))
 
 
@@ -148,7 +148,7 @@ def encode_integers(values: Integers, order: Int64s | None = None) -> bytes:
     check_array("order", order, (len(values),), INT64)
     check_inside("order", order, len(values))
     bits = np.empty((_MODES, values.shape[1]), np.int64)  # about as many as each mode takes
-    left = np.zeros(len(order), np.int64)
+    left: Int64s | int = 0
     for column, numbers in enumerate(values.T):
         ordered = numbers[order].astype(np.int64)
         both = [(each, np.diff(each, prepend=0)) for each in (ordered, ordered - left)]
@@ -156,7 +156,7 @@ def encode_integers(values: Integers, order: Int64s | None = None) -> bytes:
         left = ordered
     # Differences of differences are to be below 2^53, too.
     modes = bits[: _MODES if largest < _TOO_LARGE >> 1 else 2].argmin(0).astype(np.uint8)
-    words = _room(int(bits.min(0).sum()) + 8 * values.size)
+    words = _room(bits.min(0).sum() + 8 * values.size)
     contexts = rc.new_contexts(_INTEGER_CONTEXTS * values.shape[1])
     used = _write_integers(values, order, modes, words, contexts)
     return bytes(modes) + _bytes(words, used)

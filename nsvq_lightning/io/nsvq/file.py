@@ -1,15 +1,15 @@
 """Write and read ``.nsvq`` files, and what level ``paper`` holds."""
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
-from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry, frame, read_frame
+from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry, frame, unframe
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, listed
 from nsvq_lightning.splats.conventions import Float32s, Integers, Uint32s
@@ -79,9 +79,9 @@ def read_nsvq(path: StrPath) -> CompressedScene:
     Raises:
         FormatError: The file is truncated, altered, of a newer version or level, or not a ``.nsvq`` file.
     """
-    header, streams = read_frame(path)
+    data = Path(path).read_bytes()
     with naming_file(path):
-        return replace(decode(header, streams), stored_bytes=os.path.getsize(path))
+        return replace(decode(*unframe(data)), stored_bytes=len(data))
 
 
 def decode(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene:

@@ -247,7 +247,7 @@ def _rounded(cameras: Float64s) -> tuple[tuple[float, ...], ...]:
     """Cameras ``[C, 4]`` with the digits that count: positions to about a hundredth of their spread."""
     if len(cameras) == 0:
         return ()
-    spread = float(np.ptp(cameras[:, :3], axis=0).max()) or 1.0
+    spread = np.ptp(cameras[:, :3], axis=0).max() or 1.0
     decimals = 2 - math.floor(math.log10(spread))
     return tuple((*(round(x, decimals) for x in place), float(f"{focal:.4g}")) for *place, focal in cameras.tolist())
 
@@ -292,15 +292,10 @@ def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
     return header, streams
 
 
-def read_frame(path: StrPath) -> tuple[Header, dict[str, memoryview]]:
-    """:func:`unframe` for a file, with its name in every error."""
-    with naming_file(path):
-        return unframe(Path(path).read_bytes())
-
-
 def read_header(path: StrPath) -> Header:
     """Header of a ``.nsvq`` file, after verifying the checksum of the whole file."""
-    return read_frame(path)[0]
+    with naming_file(path):
+        return unframe(Path(path).read_bytes())[0]
 
 
 def describe_nsvq(path: StrPath) -> Json:

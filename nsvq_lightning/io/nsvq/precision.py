@@ -43,7 +43,7 @@ class Precision:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not (math.isfinite(value) and value > 0):
+            if not 0 < value < math.inf:
                 raise ValueError(f"precision: {name} must be a positive number, got {value}")
         low, high = OPACITY_ERRORS
         if not low <= self.opacity <= high:
@@ -55,8 +55,8 @@ class Precision:
 
     @property
     def opacity_levels(self) -> int:
-        """Number of levels that the opacity has."""
-        return max(2, math.ceil(0.5 / self.opacity))
+        """Number of levels that the opacity has, at least 2."""
+        return math.ceil(0.5 / self.opacity)
 
 
 # Compression levels: ``compact`` is small; ``paper`` stores float32 values and whole bits, as the paper counts.

@@ -16,7 +16,7 @@ from compressed_scenes import ON_NO_BASIS, SIZES, arrays_of, forge, framed, on_b
 
 from nsvq_lightning.io import CompressedScene, FormatError, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.entropy import encode_integers
-from nsvq_lightning.io.nsvq.header import read_frame, read_header
+from nsvq_lightning.io.nsvq.header import read_header, unframe
 from nsvq_lightning.io.nsvq.precision import LEVELS, Precision, Storage
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 
@@ -203,7 +203,7 @@ def test_another_version_is_told(tmp_path: Path, version: int) -> None:
 
 def _with_stream(path: Path, name: str, change: Any) -> None:
     """Replace a stream of a file."""
-    streams = {key: bytes(data) for key, data in read_frame(path)[1].items()}
+    streams = {key: bytes(data) for key, data in unframe(path.read_bytes())[1].items()}
     streams[name] = change(streams[name])
 
     def fit(header: dict[str, Any]) -> None:
@@ -276,7 +276,7 @@ def test_all_readers_refuse_the_same_files(tmp_path: Path) -> None:
         made = (scene(60, {}), scene(60), based)[seed % 3]
         write_nsvq(path, made, Storage(LEVELS[seed % 2]))
         generator = np.random.default_rng(seed)
-        name = str(generator.choice([name for name, stream in read_frame(path)[1].items() if len(stream)]))
+        name = str(generator.choice([name for name, stream in unframe(path.read_bytes())[1].items() if len(stream)]))
 
         def noise(stream: bytes, generator: np.random.Generator = generator) -> bytes:
             at = int(generator.integers(len(stream)))
