@@ -73,11 +73,11 @@ class Densification(SplatCallback, ABC):
                 ones matter.
         """
         limit, count = self.limit(module), len(module.splats)
-        if limit is None:
+        if limit is None or count <= limit:
             return
-        if count > limit and module.phase > Phase.PRUNE:
+        if module.phase > Phase.PRUNE:
             log.warning(f"{self.limit_name}={limit} comes too late for {count} splats with codebooks; all are kept")
-        elif count > limit:
+        else:
             kept = top_rows(run_scene.train_contributions(trainer, module.scene), limit)
             row_ops.keep_rows(module.splats, trainer.optimizers[0], kept)
             distributed.check_replicas(trainer, "the limit of splats")

@@ -92,9 +92,8 @@ class ExposureCompensation(SplatCallback):
         """Say how much the photos differ."""
         self._leave(module)
         gains = 1 + self._changes.detach()[:, :, :3].diagonal(dim1=1, dim2=2).mean(1)
-        if len(gains):
-            stops = gains.log2() - gains.log2().mean()
-            log.info(f"exposures of the train photos: {stops.min():+.2f} to {stops.max():+.2f} stops")
+        stops = gains.log2() - gains.log2().mean()
+        log.info(f"exposures of the train photos: {stops.min():+.2f} to {stops.max():+.2f} stops")
 
     def on_exception(self, trainer: Trainer, module: SplatModule, exception: BaseException) -> None:
         """Leave the module as it was."""

@@ -28,6 +28,7 @@ class SplatProgressBar(TQDMProgressBar):
         refresh_rate: Iterations between two refreshes on a terminal; 0 turns the bar off.
     """
 
+    train_description = ""
     BAR_FORMAT = "|{bar}| {n_fmt}/{total_fmt} {remaining} to {eta:%H:%M}{postfix}"
 
     def __init__(self, refresh_rate: int = 25) -> None:
@@ -97,12 +98,6 @@ class SplatProgressBar(TQDMProgressBar):
         """Close the bar, so that the error starts on a new line."""
         if self._train_progress_bar is not None:
             self._train_progress_bar.close()
-
-    def init_train_tqdm(self) -> Tqdm:
-        """The bar, without the word epoch."""
-        bar = super().init_train_tqdm()
-        bar.set_description_str("", refresh=False)
-        return bar
 
     def _text(self, trainer: Trainer, module: SplatModule) -> str:
         parts = [f"{module.phase.name.lower()} {Tqdm.format_sizeof(len(module.splats))} splats"]

@@ -196,8 +196,6 @@ class CodebookReplacement(SplatCallback):
 
     def on_save_checkpoint(self, trainer: Trainer, module: SplatModule, checkpoint: dict[str, Any]) -> None:
         """Sum the counts of all processes in the buffers of the first one, which the checkpoint holds."""
-        if trainer.world_size == 1:
-            return
         for quantizer in module.quantizers.values():
             _sum_usage(trainer, quantizer)
         self.on_train_start(trainer, module)
@@ -206,7 +204,7 @@ class CodebookReplacement(SplatCallback):
 def _sum_usage(trainer: Trainer, quantizer: Quantizer) -> None:
     """Sum the counts of all processes in the buffers of each."""
     for counter in (quantizer.usage, quantizer.window):
-        counter.copy_(distributed.sum_over_processes(trainer, counter))
+        distributed.sum_over_processes(trainer, counter)
 
 
 @dataclass(eq=False)

@@ -181,7 +181,6 @@ _operator(operator.lt, Mask, _TWO, _compared("<"))
 _operator(operator.gt, Mask, _TWO, _compared(">"))
 _operator(operator.and_, Mask, (Mask, Mask), ir.IRBuilder.and_)
 _operator(operator.or_, Mask, (Mask, Mask), ir.IRBuilder.or_)
-_operator(operator.invert, Mask, (Mask,), ir.IRBuilder.not_)
 
 # ---- memory
 # -----------------------------------------------------------------------------------------------------------

@@ -94,10 +94,8 @@ class CodebookQuantizer(nn.Module, ABC):
         self.max_codes = num_codes
         self._tracker = NearestTracker()
         self.codebook = nn.Parameter(torch.zeros(num_codes, dim))
-        self.register_buffer("usage", torch.zeros(num_codes, dtype=torch.int64))
-        self.register_buffer("window", torch.zeros((), dtype=torch.int64))
-        self.register_buffer("codes", torch.zeros(0, dtype=torch.int64))
-        self.register_buffer("held", torch.zeros(0, dtype=torch.int64))
+        for name, shape in {"usage": (num_codes,), "window": (), "codes": (0,), "held": (0,)}.items():
+            self.register_buffer(name, torch.zeros(shape, dtype=torch.int64))
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
 
     @abstractmethod

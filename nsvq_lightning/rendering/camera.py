@@ -50,14 +50,18 @@ class Camera:
         (fx, _, cx), (_, fy, cy), _ = K
         # Kept as Python floats: reading them from an accelerator would stall it at every render.
         intrinsics = fx, fy, cx, cy
-        vars(self).update(intrinsics=intrinsics, packed_view=_packed(self.viewmat))
+        turn = self.viewmat.detach().to("cpu", torch.float64, copy=True)
+        *rows, _ = turn.tolist()
+        rotation, translation = [row[:3] for row in rows], [row[3] for row in rows]
+        position = [-sum(row[k] * t for row, t in zip(rotation, translation, strict=True)) for k in range(3)]
+        packed_view = *(x for row in rotation for x in row), *translation, *position
+        vars(self).update(intrinsics=intrinsics, packed_view=packed_view)
         if not (all(map(math.isfinite, intrinsics)) and min(fx / self.width, fy / self.height) > MIN_FOCAL):
             raise ValueError(f"Camera.K needs positive, finite focal lengths and a centre, in pixels, got {intrinsics}")
         if not 0 < self.near < math.inf:
             raise ValueError(f"Camera.near must be positive and finite, got {self.near}")
         if [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] != K:
             raise ValueError(f"Camera.K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew, got {K}")
-        turn = self.viewmat.detach().to("cpu", torch.float64, copy=True)
         turn[:3, 3] *= 0  # what is not finite stays so
         if not ((turn @ turn.T - torch.eye(4)).abs().max() < 0.01 and turn.det() > 0):
             shape = "a rotation and a translation, over 0 0 0 1: is it transposed, mirrored or scaled?"
@@ -96,14 +100,6 @@ class Camera:
         moved = copy(self)
         vars(moved).update(K=K, viewmat=viewmat)
         return moved
-
-
-def _packed(viewmat: Tensor) -> tuple[float, ...]:
-    """See :attr:`Camera.packed_view`."""
-    *rows, _ = viewmat.detach().to("cpu", torch.float64).tolist()
-    rotation, translation = [row[:3] for row in rows], [row[3] for row in rows]
-    position = [-sum(row[k] * t for row, t in zip(rotation, translation, strict=True)) for k in range(3)]
-    return (*(x for row in rotation for x in row), *translation, *position)
 
 
 def camera_of(viewmat: Tensor, lens: tuple[float, ...], width: int, height: int, near: float = NEAR) -> Camera:

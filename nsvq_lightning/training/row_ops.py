@@ -155,7 +155,7 @@ def _rebind(splats: Splats, optimizer: Optimizer, name: str, values: Tensor, edi
     """Bind ``values`` as the new parameter ``name`` everywhere the old one was referenced."""
     group = find_group(optimizer, name)
     old = group["params"][0]
-    new = nn.Parameter(values.contiguous(), requires_grad=old.requires_grad)
+    new = nn.Parameter(values, requires_grad=old.requires_grad)
     state = optimizer.state.pop(old, None)
     if state is not None:
         optimizer.state[new] = {key: edit(value) if key in MOMENTS else value for key, value in state.items()}

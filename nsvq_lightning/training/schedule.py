@@ -136,10 +136,10 @@ class Schedule:
             # Rounding must not drop a phase: at least one iteration for this one and for each that follows.
             latest = self.total - sum(exists[phase + 1 :])
             ends.append(min(max(self._end(phase, end, before), before + 1), latest) if exists[phase] else before)
-        warmup, prune, quantize, finetune = (max(end, 0) for end in ends)
+        warmup, prune, quantize, finetune = (max(end, 0) - self.saved for end in ends)
         if exists[Phase.QUANTIZE] and quantize == prune:
             quantize = finetune  # a run of one iteration: codes must be placed before they are tuned
-        return warmup - self.saved, prune - self.saved, quantize - self.saved, finetune - self.saved
+        return warmup, prune, quantize, finetune
 
     def _end(self, phase: int, reference: int, before: int) -> int:
         """Where a phase that starts after iteration ``before`` ends in this run, before the rounding of tiny runs."""

@@ -40,9 +40,8 @@ class Stopwatch:
     def paused(self, device: torch.device) -> Iterator[None]:
         """Leave out the time of the body. Work already queued on ``device`` still counts as training."""
         running = self._since is not None
-        if running:
-            torch.get_device_module(device).synchronize()
-            self.stop()
+        torch.get_device_module(device).synchronize()
+        self.stop()
         try:
             yield
         finally:

@@ -98,7 +98,7 @@ def test_exponential_and_logarithm() -> None:
 def test_masks() -> None:
     def kernel(a: Array, out: Array) -> None:
         low = simd.load(a, 0) < simd.load(a, 16)
-        simd.store(out, 0, simd.where(low & ~(simd.load(a, 0) >= simd.load(a, 16)), simd.load(a, 0), simd.load(a, 16)))
+        simd.store(out, 0, simd.where(low & (simd.load(a, 0) <= simd.load(a, 16)), simd.load(a, 0), simd.load(a, 16)))
         out[16] = simd.mask_bits(low)
         out[17] = simd.lowest_bit(simd.mask_bits(low))
         out[18] = simd.mask_bits(simd.load(a, 0) > simd.load(a, 0))
