@@ -11,6 +11,7 @@ Examples:
 
 import argparse
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -49,7 +50,12 @@ def run(options: argparse.Namespace) -> int:
     folders = [options.output / str(number) for number in range(1, len(blocks) + 1)]
     for folder in folders:
         folder.mkdir(parents=True)
-    for folder, (train, test) in zip(folders, write_blocks(scene, blocks, folders), strict=True):
+    try:
+        counts = write_blocks(scene, blocks, folders)
+    except BaseException:
+        shutil.rmtree(options.output)  # so that the command can be given again
+        raise
+    for folder, (train, test) in zip(folders, counts, strict=True):
         sys.stderr.write(f"{folder}: {train} train and {test} test photos\n")
         root = folder.resolve()
         fit = ["nsvq", "fit", f"--data.root={root}", f"--trainer.run_folder={root / RUN}", *behind, *options.further]

@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 
 EXTENSION = "KHR_gaussian_splatting"
 OPACITY = f"{EXTENSION}:OPACITY"
+KERNEL = "ellipse"
 
 # Magic, version, length of the file; then, of each chunk, length and type.
 _HEAD, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
@@ -80,7 +81,7 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
         end += values.nbytes
     accessors[0] |= {"min": scene.means.min(0).tolist(), "max": scene.means.max(0).tolist()}
     about = {
-        "kernel": "ellipse",
+        "kernel": KERNEL,
         "colorSpace": "srgb_rec709_display",
         "projection": "perspective",
         "sortingMethod": "cameraDistance",
@@ -194,6 +195,8 @@ def _splats(document: Json, data: memoryview, primitive: Json) -> CompressedScen
         raise FormatError(f"splats are compressed by {', '.join(inner)}, which is not read", "save them without it")
     if about.get("colorSpace") == "lin_rec709_display":
         log.warning("colorSpace lin_rec709_display: colours are linear light and are shown as they are, too dark")
+    if (kernel := about.get("kernel", KERNEL)) != KERNEL:
+        log.warning("splats of the kernel %s are shown as of %s", kernel, KERNEL)
     given = primitive["attributes"]
     names = {f"{EXTENSION}:{name[1:]}": number for name, number in given.items() if name.startswith("_")} | given
     if len(names) > len(given):

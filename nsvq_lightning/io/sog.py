@@ -23,6 +23,7 @@ import io
 import json
 import logging
 import math
+import re
 import struct
 import zipfile
 import zlib
@@ -385,12 +386,13 @@ def _archived(path: Path) -> tuple[bytes, int]:
         return data, len(data)
     buffer = io.BytesIO()
     text = path.read_text(encoding="utf-8", errors="replace")
-    pictures = [each for each in path.parent.glob("*.*") if each.suffix.lower() in _PICTURES and each.name in text]
+    named = {name: path.parent / name for name in re.findall(r'"([^"]+)"', text) if name.lower().endswith(_PICTURES)}
+    pictures = {name: file for name, file in named.items() if file.is_file()}
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.write(path, META)
-        for picture in pictures:
-            archive.write(picture, picture.name)
-    return buffer.getvalue(), sum(file.stat().st_size for file in (path, *pictures))
+        for name, picture in pictures.items():
+            archive.write(picture, name)
+    return buffer.getvalue(), sum(file.stat().st_size for file in (path, *pictures.values()))
 
 
 def read_sog(path: StrPath) -> CompressedScene:

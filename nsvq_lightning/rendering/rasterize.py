@@ -1,6 +1,7 @@
 """One function renders splats; the device determines the back-end."""
 
 import importlib
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -45,7 +46,7 @@ def render(
     camera: Camera,
     *,
     sh_degree: int | None = None,
-    background: Tensor | None = None,
+    background: Tensor | Sequence[float] | None = None,
     pixel_weights: Tensor | None = None,
     antialiased: bool = False,
     sampling: Sampling | Tensor | float | None = None,
@@ -82,11 +83,9 @@ def render(
     if degree not in range(stored + 1):
         raise ValueError(f"sh_degree must be between 0 and the stored degree {stored}, got {sh_degree}")
     means = splats.means
-    if background is None:
-        background = means.new_zeros(3)
-    elif tuple(background.shape) != (3,):
-        raise ValueError(f"background must be one RGB colour of shape [3], got {list(background.shape)}")
-    background = background.to(means)
+    behind = means.new_zeros(3) if background is None else torch.as_tensor(background).to(means)
+    if tuple(behind.shape) != (3,):
+        raise ValueError(f"background must be one RGB colour of shape [3], got {list(behind.shape)}")
     absgrad = None
     if pixel_weights is not None:
         if tuple(pixel_weights.shape) != (camera.height, camera.width):
@@ -100,7 +99,7 @@ def render(
     elif sampling is not None:
         view_sampling = _sampling(means, camera, sampling)
     image, alpha, radii, means2d, depth = _module_of(backend, means).render(
-        splats, camera, int(degree), background, pixel_weights, absgrad, view_sampling
+        splats, camera, int(degree), behind, pixel_weights, absgrad, view_sampling
     )
     return Render(image, alpha, radii, means2d, depth, absgrad)
 

@@ -15,6 +15,7 @@ import pytest
 
 from nsvq_lightning.commands import split
 from nsvq_lightning.commands.main import main
+from nsvq_lightning.data import blocks
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import read_scene, save
 from nsvq_lightning.splats.splats import Splats
@@ -73,6 +74,15 @@ def test_documented_lines_keep_paths_with_spaces_and_quotes(tmp_path: Path, page
     environment = os.environ | {"PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"}
     subprocess.run(["sh", "-c", shell], env=environment, check=True, timeout=60)
     assert said.read_text().splitlines() == words
+
+
+def test_a_split_that_fails_leaves_nothing(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(blocks, "MIN_SHOWN", 1.1)  # no part is in any photo
+    assert main(["split", str(demo_scene), str(tmp_path / "parts"), "--blocks", "2"]) == 1
+    assert "ask for fewer parts" in capsys.readouterr().err
+    assert not (tmp_path / "parts").exists()
 
 
 def test_a_folder_without_parts_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

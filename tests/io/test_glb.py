@@ -219,6 +219,8 @@ def test_whole_numbers_are_fractions_only_where_that_is_said(tmp_path: Path, nor
 def test_linear_light_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     save(plain_scene(20, 0), tmp_path / "x.glb")
     document, data = parts(tmp_path / "x.glb")
-    document["meshes"][0]["primitives"][0]["extensions"][NAME]["colorSpace"] = "lin_rec709_display"
+    about = document["meshes"][0]["primitives"][0]["extensions"][NAME]
+    about |= {"colorSpace": "lin_rec709_display", "kernel": "beta"}
     read_scene(write(tmp_path / "y.glb", document, data))
+    assert "splats of the kernel beta are shown as of ellipse" in caplog.text
     assert "lin_rec709_display: colours are linear light" in caplog.text

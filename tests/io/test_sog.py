@@ -96,10 +96,15 @@ def test_a_wrong_description_of_version_1(tmp_path: Path, change: Any, message: 
         read_scene(bundled(tmp_path / "y.sog", meta, files))
 
 
-@pytest.mark.parametrize("kind", ["PNG", "WEBP"])
-def test_a_folder_of_pictures(tmp_path: Path, kind: str) -> None:
+@pytest.mark.parametrize(("kind", "below"), [("PNG", ""), ("WEBP", ""), ("WEBP", "pictures/")])
+def test_a_folder_of_pictures(tmp_path: Path, kind: str, below: str) -> None:
     meta, files = contents(coded_scene(COUNT, 1), tmp_path)
-    text, suffix = json.dumps(meta).replace(".webp", f".{kind.lower()}"), f".{kind.lower()}"
+    suffix = f".{kind.lower()}"
+    text = json.dumps(meta)
+    for name in files:
+        text = text.replace(name, below + name.replace(".webp", suffix))
+    files = {below + name: data for name, data in files.items()}
+    (tmp_path / below).mkdir(exist_ok=True)
     (tmp_path / "meta.json").write_text(text)
     Image.new("RGB", (9, 9)).save(tmp_path / f"photo{suffix}")  # of no concern
     for name, data in files.items():

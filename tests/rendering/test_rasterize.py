@@ -79,7 +79,8 @@ def test_no_splat_in_view_is_background(antialiased: bool) -> None:
     torch.testing.assert_close(result.image, background.expand_as(result.image))
     assert all((gradient == 0).all() for gradient in gradients.values())
     nothing = RawSplats(*(tensor[:0] for tensor in splats))
-    torch.testing.assert_close(render(nothing, front_camera(), background=background).image, result.image.detach())
+    for given in (background, (0.1, 0.2, 0.3), background.numpy()):
+        torch.testing.assert_close(render(nothing, front_camera(), background=given).image, result.image.detach())
 
 
 @pytest.mark.parametrize("attribute", ["means", "quats", "scales", "opacities"])
