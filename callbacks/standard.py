@@ -63,7 +63,7 @@ def standard(config: str | None = None, /, **replaced: Callback | None) -> list[
         replaced: Callbacks that replace those of the same name in :data:`STANDARD`; None leaves one out.
 
     Raises:
-        ValueError: There is no callback of that name.
+        ValueError: There is no callback, or config, of that name.
 
     Example:
         >>> from nsvq_lightning.callbacks import OPTIONAL, STANDARD, DensityControl, standard
@@ -76,7 +76,10 @@ def standard(config: str | None = None, /, **replaced: Callback | None) -> list[
     unknown = sorted(set(replaced) - set(STANDARD))
     if unknown:
         raise ValueError(f"there is no standard callback {', '.join(unknown)}; there are {', '.join(STANDARD)}")
-    text = "{}" if config is None else (folder_of("configs") / f"{config}.yaml").read_text(encoding="utf-8")
+    configs = {path.stem: path for path in folder_of("configs").glob("*.yaml")}
+    if config not in (None, *configs):
+        raise ValueError(f"there is no config {config}; there are {', '.join(sorted(configs))}")
+    text = "{}" if config is None else configs[config].read_text(encoding="utf-8")
     settings = {name: _made(name, value) for name, value in yaml.safe_load(text).get("callbacks", {}).items()}
     given = dict.fromkeys(OPTIONAL) | settings | replaced
     chosen = (given[name] if name in given else kind() for name, kind in STANDARD.items())

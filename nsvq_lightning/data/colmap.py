@@ -241,7 +241,10 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
     if not root.is_dir():
         raise SceneError(NO_FOLDER.format(root))
     files = model_files(root, chosen)
-    cameras = {row.number: row for row in _table(files["cameras"], tables.read_cameras)}
+    listed = _table(files["cameras"], tables.read_cameras)
+    cameras = {row.number: row for row in listed}
+    if any(cameras[row.number] != row for row in listed):
+        raise SceneError(f"{files['cameras']} has two cameras of one number: export the model again")
     rows = sorted(_table(files["images"], tables.read_images), key=lambda row: row.name)
     if not rows:
         raise SceneError(f"{files['images']} lists no registered image: run COLMAP's mapper again")

@@ -277,7 +277,10 @@ def _frames(file: Path, allow_outside: bool) -> tuple[Json, dict[str, _Frame]]:
     for position, own in enumerate(head["frames"]):
         if not isinstance(own, dict):
             raise SceneError(f"{file}: frame {position} is no table of values: export the file again")
-        values = {key: value for key, value in (shared | own).items() if value is not None}
+        # Its own angle comes before a focal length of the file.
+        angle = any(key.startswith("camera_angle_") for key in own)
+        common = {key: value for key, value in shared.items() if not (angle and key.startswith("fl_"))}
+        values = {key: value for key, value in (common | own).items() if value is not None}
         frame = _Frame(file, position, values)
         if not frame.path("file_path"):
             raise frame.error("has no file_path")

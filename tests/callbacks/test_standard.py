@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
@@ -60,3 +62,9 @@ def test_a_shipped_config_gives_its_callbacks() -> None:
     assert phases.schedule(45_000).ends == (15_000, 20_000, 43_000, 45_000)
     assert any(isinstance(each, RateDistortion) for each in standard("small"))
     assert {type(each) for each in standard("fast")} == {type(each) for each in standard()}
+
+
+@pytest.mark.parametrize("make", [lambda: standard("nosuch"), lambda: standard(nosuch=None)])
+def test_names_that_are_not_known_are_told_with_those_that_are(make: Callable[[], object]) -> None:
+    with pytest.raises(ValueError, match=r"there is no (config|standard callback) nosuch; there are .*(small|density)"):
+        make()

@@ -175,6 +175,15 @@ def test_one_photo_has_one_pose_and_a_camera(make_scene: SceneFactory) -> None:
     path.write_text(path.read_text().replace(" 1 001.png", " 7 001.png"))
     with pytest.raises(SceneError, match=r"images\.txt: photo 001\.png is of camera 7, which cameras\.txt does not"):
         read_model(path.parents[2])
+    cameras = path.with_name("cameras.txt")
+    text = path.read_text()
+    path.write_text(text.replace(" 7 001.png", " 1 001.png"))
+    (line,) = (line for line in cameras.read_text().splitlines() if not line.startswith("#"))
+    cameras.write_text(f"{line}\n{line}\n")
+    assert len(read_model(path.parents[2]).cameras) == 1
+    cameras.write_text(f"{line}\n{line}5\n")
+    with pytest.raises(SceneError, match=r"cameras\.txt has two cameras of one number"):
+        read_model(path.parents[2])
 
 
 def test_text_table_of_fewer_rows_than_announced(make_scene: SceneFactory, caplog: pytest.LogCaptureFixture) -> None:

@@ -102,6 +102,8 @@ def test_values_of_a_frame_come_first(make_scene: SceneFactory, tmp_path: Path) 
     root = write_pinhole(make_scene(), tmp_path / "json")
     change(root / "transforms.json", {"fl_x": 33.0, "cx": 20.5})
     cameras = load_scene(root).cameras
+    change(root / "transforms.json", {"fl_x": None, "cx": None, "camera_angle_x": 2 * math.atan(20 / 24)})
+    assert load_scene(root).cameras[0].intrinsics == pytest.approx((24, 24, 21, 15))
     assert cameras[0].intrinsics == pytest.approx((33, 31, 20.5, 15))
     assert cameras[1].intrinsics == pytest.approx((30, 31, 21, 15))
 
