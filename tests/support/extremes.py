@@ -35,7 +35,6 @@ BROKEN_ROWS = 7
 """Splats of a broken scene with a number that is not finite."""
 WIDTH, HEIGHT = 72, 48
 DISTANCE = 4.0
-BACKGROUND = (0.2, 0.3, 0.4)
 SCALES = (1e-12, 1e-6, 1.0, 1e6, 1e12)
 FAR = 1e6
 """Scene units."""
@@ -164,7 +163,7 @@ def _workload(name: str, splats: RawSplats, camera: Camera | None = None) -> Wor
     camera = _camera() if camera is None else camera
     shape = camera.height, camera.width, 3
     gradient = torch.randn(shape, generator=generator(0, 0, "image gradient")) / math.prod(shape)
-    return Workload(name, splats, camera, torch.tensor(BACKGROUND), gradient)
+    return Workload(name, splats, camera, gradient)
 
 
 def _shapes(splats: RawSplats) -> Iterator[tuple[str, RawSplats]]:
