@@ -59,8 +59,8 @@ _TABLE_OFFSET = struct.Struct("<I12x")
 _HEAD = _HEADER.size + _TABLE_OFFSET.size
 # Compressed and uncompressed bytes of a stream.
 _ENTRY = struct.Struct("<QQ")
-# The flags of a scene that was trained with anti-aliasing, and of extensions.
-ANTIALIASED, _EXTENDED = 1, 2
+# The flags of a scene that was trained with anti-aliasing, of extensions, and of levels of detail, as Spark has them.
+ANTIALIASED, _EXTENDED, _LEVELS = 1, 2, 0x80
 # Type and length, then the number of the axes.
 _EXTENSION = struct.Struct("<III")
 # The extension that states the axes.
@@ -229,11 +229,12 @@ def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
         contents[name] = _inflate(gunzip, gunzip.unconsumed_tail, size)
         if len(contents[name]) < size:
             raise FormatError(f"truncated: {name} of {header.count} splats has {len(contents[name])} of {size} bytes")
+    if header.flags & _LEVELS and header.count:
+        _inflate(gunzip, gunzip.unconsumed_tail, 6 * header.count)  # how the levels follow from each other
     # Extensions follow the arrays; reading to the end of the stream verifies its checksum.
-    most = _MAX_EXTENDED + 6 * header.count  # so many have levels of detail
-    extensions = _inflate(gunzip, gunzip.unconsumed_tail, most)
+    extensions = _inflate(gunzip, gunzip.unconsumed_tail, _MAX_EXTENDED)
     if not gunzip.eof:
-        raise FormatError(f"truncated, or more than {most} bytes of extensions: the gzip stream has no end")
+        raise FormatError(f"truncated, or more than {_MAX_EXTENDED} bytes of extensions: the gzip stream has no end")
     return _with_axes(header, extensions), contents
 
 

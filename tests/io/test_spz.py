@@ -130,3 +130,13 @@ def test_flags_that_are_not_known_are_told(tmp_path: Path, caplog: pytest.LogCap
     (tmp_path / "x.spz").write_bytes(gzip.compress(head + bytes(200_000 * 26), 1))
     assert len(read_scene(tmp_path / "x.spz")) == 200_000
     assert "unknown flags 0x80" in caplog.text
+
+
+def test_axes_are_read_behind_levels_of_detail(tmp_path: Path) -> None:
+    save(plain_scene(9, 1), tmp_path / "a.spz", axes="rub")
+    plain = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    start = 16 + 9 * (20 + 9)  # of the extension
+    changed = bytearray(plain[:start] + bytes(range(54)) + plain[start:])
+    changed[14] |= 0x80
+    (tmp_path / "b.spz").write_bytes(gzip.compress(changed))
+    np.testing.assert_array_equal(read_scene(tmp_path / "b.spz").means, read_scene(tmp_path / "a.spz").means)

@@ -84,7 +84,7 @@ def test_extensions_without_end_are_refused(tmp_path: Path) -> None:
     spz3(tmp_path / "a.spz", 3, extensions=1 << 19)
     assert len(read_scene(tmp_path / "a.spz")) == 3
     spz3(tmp_path / "a.spz", 3, extensions=1 << 21)
-    with pytest.raises(FormatError, match=r"more than 10485\d\d bytes of extensions"):
+    with pytest.raises(FormatError, match="more than 1048576 bytes of extensions"):
         read_scene(tmp_path / "a.spz")
 
 
