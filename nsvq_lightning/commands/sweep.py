@@ -144,8 +144,10 @@ def plan(options: argparse.Namespace) -> list[Run]:
     for config in options.configs:
         arguments = [*_given({"config": config}), *common]
         default = yaml.safe_load(resolve([*arguments, *_given({"data.root": options.scenes[0]})]))
-        if given := default["ckpt_path"] or default["trainer"]["run_folder"]:
-            raise ValueError(f"a sweep has checkpoints and folders of its own; leave {given} out")
+        own = {"ckpt_path": default["ckpt_path"], "trainer.run_folder": default["trainer"]["run_folder"]}
+        for option, given in own.items():
+            if given is not None:
+                raise ValueError(f"a sweep has checkpoints and folders of its own; leave {option}={given} out")
         quantizers, sizes = options.quantizers, options.codebooks
         if default["model"]["codebooks"] is None:
             quantizers = sizes = ("",)

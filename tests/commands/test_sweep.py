@@ -112,9 +112,10 @@ def test_what_cannot_be_is_said_at_once(scenes: tuple[str, str], tmp_path: Path)
     ):
         with pytest.raises(SystemExit):
             planned(fox, wrong)
-    for own in ("--ckpt_path=a.ckpt", "--trainer.run_folder=a"):
-        with pytest.raises(ValueError, match=r"folders of its own; leave a(\.ckpt)? out"):
-            planned(fox, own)
+    with pytest.raises(ValueError, match=r"ckpt_path=a\.ckpt"):
+        planned(fox, "--ckpt_path=a.ckpt")
+    with pytest.raises(ValueError, match=r"folders of its own; leave trainer\.run_folder=a out"):
+        planned(fox, "--trainer.run_folder=a")
 
 
 def test_settings_as_a_file_are_the_same_settings(tmp_path: Path) -> None:
