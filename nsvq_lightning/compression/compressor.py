@@ -3,16 +3,16 @@
 import logging
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
 from lightning.pytorch import Callback
 from torch import Tensor
-from torch.nn import Parameter, ParameterDict
+from torch.nn import Parameter
 
 from nsvq_lightning import callbacks as cb
 from nsvq_lightning.callbacks.forecast import iteration_seconds
@@ -37,6 +37,9 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.training.trainer import SplatTrainer
+
+if TYPE_CHECKING:
+    from nsvq_lightning.io.compressed import AnySplats
 
 log = logging.getLogger(__name__)
 
@@ -441,7 +444,7 @@ class Compressor:
 
 @torch.inference_mode(False)
 def compress(
-    splats: CompressedScene | SplatTensors | Mapping[str, Tensor] | ParameterDict,
+    splats: "AnySplats",
     cameras: Sequence[Camera] = (),
     photos: Sequence[Tensor] = (),
     *,

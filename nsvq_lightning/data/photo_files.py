@@ -185,7 +185,7 @@ def find_masks(
     places = usual
     if not usual and not has_own and folders[-1] == "masks":
         below = sorted({*root.glob("*"), *photos.glob("*")})
-        places = [path for path in below if path.is_dir() and _OF_MASKS.search(path.name)]
+        places = [path for path in below if _OF_MASKS.search(path.name) and path.is_dir()]
         places.append(photos)
     found = {place: masks for place in places if any(masks := _masks_in(place, named, files, place == photos))}
     shown = " and ".join(map(str, found or usual))

@@ -126,7 +126,7 @@ class CompressedScene:
             return splats
         named = splats if isinstance(splats, Mapping | torch.nn.ParameterDict) else detached(splats)._asdict()
         rows = {
-            NERFSTUDIO.get(name, name): torch.as_tensor(values).detach().cpu().float().numpy().copy()
+            NERFSTUDIO.get(name, name): torch.as_tensor(values).detach().to("cpu", torch.float32, copy=True).numpy()
             for name, values in named.items()
         }
         if missing := set(splat.ATTRIBUTES) - {"shN"} - rows.keys():
