@@ -22,8 +22,11 @@ ours: right, down, front (RDF). So these are the default, also of a file that do
 opposite direction, coordinates change sign, and with them the coefficients of odd functions.
 
 The container is one gzip stream up to version 3: a header of 16 bytes, the arrays, and perhaps extensions, of which
-only that of the axes is read and written. In version 4, the header is followed by the offset of a table, 12 zero bytes,
-extensions, the table, and one Zstandard stream for each array that is not empty.
+only that of the axes is read and written. With levels of detail, as Spark writes them, a tree follows the arrays, and
+opacities are in 127.5ths: the finest level is read, the splats without children.
+
+In version 4, the header is followed by the offset of a table, 12 zero bytes, extensions, the table, and one Zstandard
+stream for each array that is not empty.
 """
 
 import gzip
@@ -84,7 +87,7 @@ class SpzHeader:
         count: Number of splats N.
         sh_degree: Degree of the spherical harmonics, 0 to 4, of which 3 are read.
         fraction_bits: Fractional bits of the positions.
-        flags: :data:`ANTIALIASED`, and 2 where extensions follow.
+        flags: :data:`ANTIALIASED`, 2 where extensions follow, and 128 where splats are a tree.
         system: Number that says where x, y and z point, see :data:`_SYSTEMS`; 0 if the file does not say.
     """
 
@@ -96,6 +99,11 @@ class SpzHeader:
     system: int = 0
 
     @property
+    def has_levels(self) -> bool:
+        """Whether splats are a tree, in which one with children stands for these."""
+        return self.version < 4 and bool(self.flags & _LEVELS)
+
+    @property
     def sizes(self) -> dict[str, int]:
         """Bytes per splat of each array, in file order."""
         return {
@@ -105,6 +113,8 @@ class SpzHeader:
             "scales": 3,
             "quats": 4 if self.version >= 3 else 3,
             "shN": 3 * ((self.sh_degree + 1) ** 2 - 1),
+            # All numbers of children, then all indices of the first child.
+            "tree": 6 if self.has_levels else 0,
         }
 
     @property
@@ -229,8 +239,6 @@ def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
         contents[name] = _inflate(gunzip, gunzip.unconsumed_tail, size)
         if len(contents[name]) < size:
             raise FormatError(f"truncated: {name} of {header.count} splats has {len(contents[name])} of {size} bytes")
-    if header.flags & _LEVELS and header.count:
-        _inflate(gunzip, gunzip.unconsumed_tail, 6 * header.count)  # how the levels follow from each other
     # Extensions follow the arrays; reading to the end of the stream verifies its checksum.
     extensions = _inflate(gunzip, gunzip.unconsumed_tail, _MAX_EXTENDED)
     if not gunzip.eof:
@@ -257,10 +265,11 @@ def _parse(start: bytes, file_bytes: int) -> SpzHeader:
         raise FormatError(f"damaged: SH degree {sh_degree}, not 0 to 4")
     if fraction_bits > MAX_FRACTION:
         raise FormatError(f"damaged: {fraction_bits} fractional bits, more than {MAX_FRACTION}")
-    if strange := flags & ~(ANTIALIASED | _EXTENDED):
-        logger.warning("unknown flags 0x%02x of .spz: if they mean levels of detail, these are not told apart", strange)
     check_room("splats", count, file_bytes)
-    return SpzHeader(version, count, sh_degree, fraction_bits, flags)
+    header = SpzHeader(version, count, sh_degree, fraction_bits, flags)
+    if strange := flags & ~(ANTIALIASED | _EXTENDED | header.has_levels * _LEVELS):
+        logger.warning("unknown flags 0x%02x of .spz", strange)
+    return header
 
 
 def _signs(axes: str, sh_degree: int) -> tuple[Float32s, Float32s, Float32s]:
@@ -390,6 +399,7 @@ def read_spz(path: StrPath) -> CompressedScene:
     degree = min(header.sh_degree, 3)
     if header.sh_degree > degree:
         logger.warning("%s: of SH degree %d, degrees up to %d are read", path, header.sh_degree, degree)
+    factor = np.uint8(1 + header.has_levels)  # a splat that stands for several may be above 1
     system = header.system or _SYSTEMS.index(DEFAULT_AXES.upper()) + 1
     xyz, quats, harmonics = _signs(_SYSTEMS[(system - 1) % 8], degree)
     scene = CompressedScene.from_rows(
@@ -397,12 +407,15 @@ def read_spz(path: StrPath) -> CompressedScene:
             "means": _unpacked_means(header, arrays["means"]) * xyz,
             "quats": _unpacked_quats(header, arrays["quats"]) * quats,
             "scales": arrays["scales"].astype(np.float32) / 16 - 10,
-            "opacities": logits_of_bytes(arrays["opacities"]),
+            "opacities": logits_of_bytes(np.minimum(arrays["opacities"], 255 // factor) * factor),
             "sh0": ((np.arange(256) / 255 - 0.5) / _COLOR).astype(np.float32)[arrays["sh0"]],
             "shN": _unpacked_harmonics(arrays["shN"], harmonics),
         },
         antialiased=bool(header.flags & ANTIALIASED),
     )
+    if header.has_levels:
+        scene = scene.take(np.flatnonzero(arrays["tree"].reshape(-1)[: 2 * header.count].view("<u2") == 0))
+        logger.info("%s: levels of detail; the finest is read, %d of %d splats", path, len(scene), header.count)
     # Signs first, then the turn, as Niantic's library does it, which writes such files.
     return rotated(scene, UP_AXES["z"]) if system > 8 else scene
 

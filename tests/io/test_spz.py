@@ -10,7 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from compressed_scenes import arrays_of
-from viewer_scenes import assert_same, coded_scene, needs_zstd, plain_scene
+from viewer_scenes import assert_same, coded_scene, needs_zstd, plain_scene, sigmoid
 
 from nsvq_lightning.io import FormatError, read_scene, save
 from nsvq_lightning.io.spz import zstd_compress, zstd_decompress
@@ -125,18 +125,28 @@ def test_of_degree_4_the_first_three_are_read(tmp_path: Path, degree: int, caplo
 
 
 def test_flags_that_are_not_known_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """0x80 are the levels of detail of Spark: six more bytes a splat."""
-    head = struct.pack("<4sIIBBBB", b"NGSP", 3, 200_000, 0, 12, 0x80, 0)
-    (tmp_path / "x.spz").write_bytes(gzip.compress(head + bytes(200_000 * 26), 1))
-    assert len(read_scene(tmp_path / "x.spz")) == 200_000
-    assert "unknown flags 0x80" in caplog.text
+    head = struct.pack("<4sIIBBBB", b"NGSP", 3, 5, 0, 12, 0x40, 0)
+    (tmp_path / "x.spz").write_bytes(gzip.compress(head + bytes(5 * 20)))
+    assert len(read_scene(tmp_path / "x.spz")) == 5
+    assert "unknown flags 0x40" in caplog.text
 
 
-def test_axes_are_read_behind_levels_of_detail(tmp_path: Path) -> None:
+def test_of_levels_of_detail_the_finest_is_read(tmp_path: Path) -> None:
+    """Spark's flag 0x80: numbers of children and first children behind the arrays, opacities in halves of 255ths."""
     save(plain_scene(9, 1), tmp_path / "a.spz", axes="rub")
     plain = gzip.decompress((tmp_path / "a.spz").read_bytes())
     start = 16 + 9 * (20 + 9)  # of the extension
-    changed = bytearray(plain[:start] + bytes(range(54)) + plain[start:])
+    tree = np.array([2, 2, 5] + [0] * 6, "<u2").tobytes() + np.array([1, 3, 4] + [0] * 6, "<u4").tobytes()
+    changed = bytearray(plain[:start] + tree + plain[start:])
     changed[14] |= 0x80
+    opacities = slice(16 + 9 * 9, 16 + 9 * 10)
+    changed[opacities] = [level // 2 for level in changed[opacities]]
     (tmp_path / "b.spz").write_bytes(gzip.compress(changed))
-    np.testing.assert_array_equal(read_scene(tmp_path / "b.spz").means, read_scene(tmp_path / "a.spz").means)
+    whole, finest = read_scene(tmp_path / "a.spz"), read_scene(tmp_path / "b.spz")
+    np.testing.assert_array_equal(finest.means, whole.means[3:])
+    np.testing.assert_array_equal(finest.values("shN"), whole.values("shN")[3:])
+    np.testing.assert_allclose(sigmoid(finest.opacities), sigmoid(whole.opacities[3:]), atol=1.01 / 255)
+
+    (tmp_path / "b.spz").write_bytes(gzip.compress(changed[: start + 50]))
+    with pytest.raises(FormatError, match="truncated: tree of 9 splats has 50 of 54 bytes"):
+        read_scene(tmp_path / "b.spz")
