@@ -293,10 +293,9 @@ class DensityControl(Densification):
 @torch.no_grad()
 def reset_opacities(module: SplatModule, ceiling: float) -> None:
     """Lower all opacities to at most ``ceiling``, and forget their moments."""
-    optimizer = module.trainer.optimizers[0]
     lowered = module.splats.opacities.clamp(max=math.log(ceiling / (1.0 - ceiling)))
     row_ops.replace_attribute(module.splats, "opacities", lowered)
-    row_ops.reset_moments(optimizer, "opacities")
+    row_ops.reset_moments(module.trainer.optimizers[0], "opacities")
     distributed.check_replicas(module.trainer, "the opacity reset")
 
 

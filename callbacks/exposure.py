@@ -56,7 +56,7 @@ class ExposureCompensation(SplatCallback):
         self._row = {view: row for row, view in enumerate(scene.train)}
         start = torch.zeros(len(scene.train), 3, 4)
         if self._loaded is not None:
-            start = self._loaded["changes"].detach().clone()
+            start = self._loaded["changes"].clone()
             if len(start) != len(scene.train):
                 raise ValueError(
                     f"the checkpoint has exposures of {len(start)} train photos, {scene.root} has {len(scene.train)}: "

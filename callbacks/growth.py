@@ -70,7 +70,7 @@ class SplatBudget(SplatCallback):
         """
         budget, reason = self.splats or 0, "as asked"
         if self.bytes is not None:
-            codebooks = {name: tuple(quantizer.codebook.shape) for name, quantizer in module.quantizers.items()}
+            codebooks = {name: quantizer.codebook.shape for name, quantizer in module.quantizers.items()}
             stored = module.splats.sh_degree, module.storage.precision, module.rate_strength, module.values_per_splat
             budget = splats_for_bytes(self.bytes, codebooks, *stored)
             reason = f"for a file of {self.bytes} bytes"

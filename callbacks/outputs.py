@@ -137,7 +137,7 @@ class LiveScene(WritingCallback):
             return
         began = time.monotonic()
         with module.stopwatch.paused(module.device):
-            splats = type(module.splats).from_tensors(*module.scene.hard_splats(module.phase)).to("cpu")
+            splats = module.scene.hard_splats(module.phase)
             state = {"iteration": trainer.global_step, "of": trainer.max_steps, "phase": module.phase.name.lower()}
             if module.history:
                 state["psnr"] = f"{module.history[-1]['psnr']:.2f}"

@@ -58,7 +58,7 @@ class CanonicalCovariance(SplatCallback):
         if module.quantizers.keys().isdisjoint(("scales", "quats")) or not self.is_due(module, iteration):
             return
         optimizer, splats = trainer.optimizers[0], module.splats
-        new = canonical(splats.scales.detach(), splats.quats.detach())
+        new = canonical(splats.scales, splats.quats)
         row_ops.change_coordinates(splats, optimizer, "scales", new.scales, new.scale_maps)
         row_ops.change_coordinates(splats, optimizer, "quats", new.quats, new.quat_maps)
         log.info("iteration %d: each covariance as one of its 48 pairs of scale and rotation", iteration)
@@ -182,7 +182,7 @@ class CodebookReplacement(SplatCallback):
             else:
                 replaced = quantizer.replace_unused(draws, rows=module.scene.rows(name), jitter=self.jitter)
                 row_ops.reset_moments(trainer.optimizers[0], optim.codebook_group(name), replaced)
-            values[f"codebook/{name}_replaced"] = float(len(replaced))
+            values[f"codebook/{name}_replaced"] = len(replaced)
             log.debug("iteration %d: replaced %d codes of %s", iteration, len(replaced), name)
         distributed.check_replicas(trainer, "the replacement of codes")
         module.log_dict(values, batch_size=1)

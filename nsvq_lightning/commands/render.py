@@ -118,6 +118,8 @@ def _path(
 
     kind = options.path or ("through" if cameras else "orbit")
     fps = options.fps or FPS
+    if kind not in ("through", "orbit") and (options.frames or options.seconds):
+        raise ValueError(f"--frames and --seconds are for the paths through and orbit; {kind} has frames of its own")
     if kind not in ("through", "cameras", "orbit"):
         near = min(camera.near for camera in cameras or likely_cameras(splats, 1))  # which the path does not say
         path, own = read_camera_path(Path(kind))

@@ -399,4 +399,4 @@ def difference(rows: Sequence[Row], first: Sequence[Row]) -> str:
         return f"{found[0]:+.2f}, one seed"
     mean, error = np.mean(found), stats.sem(found)
     noise = not stats.ttest_1samp(found, 0).pvalue < CHANCE  # NaN where all are 0
-    return f"{mean:+.3f} ± {error:.3f}{', noise' * bool(noise)}"
+    return f"{mean:+.3f} ± {error:.3f}{', noise' * noise}"

@@ -346,7 +346,7 @@ class Compressor:
 
     def _train(self, setting: Setting) -> CompressedScene:
         """Select and quantize splats, and train what is left."""
-        sizes = {} if setting.codebooks == "none" else dict(attributes.codebook_sizes(setting.codebooks))
+        sizes = {} if setting.codebooks == "none" else attributes.codebook_sizes(setting.codebooks)
         if "shN" in sizes:
             sizes["shN"] += setting.more
         if self.parts > 1 and (sizes or setting.splats < len(self.scene)):

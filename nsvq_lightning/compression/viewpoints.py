@@ -108,7 +108,7 @@ def own_scene(
     Raises:
         ValueError: There is not one photo of the camera's size for each camera.
     """
-    if photos and [tuple(photo.shape) for photo in photos] != [(camera.height, camera.width, 3) for camera in cameras]:
+    if photos and [photo.shape for photo in photos] != [(camera.height, camera.width, 3) for camera in cameras]:
         raise ValueError(f"expected a photo [H, W, 3] of its size for each of {len(cameras)} cameras")
     split = "1 in 8" if photos else OWN
     bytes_ = [

@@ -273,7 +273,7 @@ class ImageSource:
             image, kept = self.undistortion(image, kept)
         image, kept = resized(image, kept, (self.pinhole.width, self.pinhole.height))
         if kept is None or kept.all():
-            return Picture(torch.from_numpy(np.ascontiguousarray(image)), None)
+            return Picture(torch.from_numpy(image), None)
         if not kept.any():
             raise SceneError(
                 f"no pixel of {self.path} counts{'' if self.mask is None else f' by its mask {self.mask}'}: masks are "
@@ -421,4 +421,4 @@ class ImageStore:
 def write_pixels(path: Path, pixels: Uint8s) -> None:
     """Write pixels ``[H, W]`` or ``[H, W, 3]`` BGR as PNG, atomically, and make the folder."""
     make_folder_of(path)
-    write_bytes(path, cv2.imencode(".png", np.ascontiguousarray(pixels))[1].tobytes())
+    write_bytes(path, cv2.imencode(".png", pixels)[1].tobytes())

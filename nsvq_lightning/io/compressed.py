@@ -126,8 +126,10 @@ class CompressedScene:
             return splats
         named = splats if isinstance(splats, Mapping | torch.nn.ParameterDict) else detached(splats)._asdict()
         rows = {
-            NERFSTUDIO.get(name, name): torch.as_tensor(values).detach().to("cpu", torch.float32, copy=True).numpy()
-            for name, values in named.items()
+            NERFSTUDIO.get(name, name): values.detach().to("cpu", torch.float32, copy=True).numpy()
+            if isinstance(values, torch.Tensor)
+            else np.array(values, np.float32)
+            for name, values in named.get("splats", named).items()  # which checkpoints of gsplat have
         }
         if missing := set(splat.ATTRIBUTES) - {"shN"} - rows.keys():
             raise ValueError(f"the splats have no {', '.join(sorted(missing))}")
@@ -175,6 +177,8 @@ class CompressedScene:
             return first
         if len({scene.antialiased for scene in scenes}) > 1:
             raise ValueError("some scenes were trained with anti-aliasing and some were not; they cannot be joined")
+        if len({scene.background for scene in scenes}) > 1:
+            log.warning("some scenes are seen before white, some before black; the first decides what is behind all")
         degree = max(scene.sh_degree for scene in scenes)
         scenes = [scene.with_degree(degree) for scene in scenes]
         codes, codebooks, raw = {}, {}, {}

@@ -52,6 +52,8 @@ def wrong_start(suffix: str, data: bytes, magic: bytes) -> FormatError:
 
 # An object of JSON.
 Json = dict[str, Any]
+# A file, or a part of one.
+Bytes = bytes | memoryview
 
 
 def json_object(text: bytes, name: str) -> Json:

@@ -102,6 +102,8 @@ def save(scene: "AnySplats", path: StrPath, storage: Storage | None = None, **op
         scene = CompressedScene.from_splats(scene).finite()
     if any(scene.origin) and not entry.native:
         logger.warning("%s: the origin %s of the positions is not stored; add it in the viewer", path, scene.origin)
+    if any(scene.background) and not entry.native:
+        logger.warning("%s: that white is behind the splats is not stored; set it in the viewer", path)
     if entry.native:
         options["storage"] = storage
     elif storage is not None:

@@ -99,11 +99,6 @@ class SpzHeader:
     system: int = 0
 
     @property
-    def has_levels(self) -> bool:
-        """Whether splats are a tree, in which one with children stands for these."""
-        return self.version < 4 and bool(self.flags & _LEVELS)
-
-    @property
     def sizes(self) -> dict[str, int]:
         """Bytes per splat of each array, in file order."""
         return {
@@ -113,8 +108,8 @@ class SpzHeader:
             "scales": 3,
             "quats": 4 if self.version >= 3 else 3,
             "shN": 3 * ((self.sh_degree + 1) ** 2 - 1),
-            # All numbers of children, then all indices of the first child.
-            "tree": 6 if self.has_levels else 0,
+            # All numbers of children, then all indices of the first child: one with children stands for these.
+            "tree": 6 if self.version < 4 and self.flags & _LEVELS else 0,
         }
 
     @property
@@ -267,7 +262,7 @@ def _parse(start: bytes, file_bytes: int) -> SpzHeader:
         raise FormatError(f"damaged: {fraction_bits} fractional bits, more than {MAX_FRACTION}")
     check_room("splats", count, file_bytes)
     header = SpzHeader(version, count, sh_degree, fraction_bits, flags)
-    if strange := flags & ~(ANTIALIASED | _EXTENDED | header.has_levels * _LEVELS):
+    if strange := flags & ~(ANTIALIASED | _EXTENDED | (_LEVELS if header.sizes["tree"] else 0)):
         logger.warning("unknown flags 0x%02x of .spz", strange)
     return header
 
@@ -399,7 +394,7 @@ def read_spz(path: StrPath) -> CompressedScene:
     degree = min(header.sh_degree, 3)
     if header.sh_degree > degree:
         logger.warning("%s: of SH degree %d, degrees up to %d are read", path, header.sh_degree, degree)
-    factor = np.uint8(1 + header.has_levels)  # a splat that stands for several may be above 1
+    factor = np.uint8(2 if arrays["tree"].size else 1)  # a splat that stands for several may be above 1
     system = header.system or _SYSTEMS.index(DEFAULT_AXES.upper()) + 1
     xyz, quats, harmonics = _signs(_SYSTEMS[(system - 1) % 8], degree)
     scene = CompressedScene.from_rows(
@@ -413,7 +408,7 @@ def read_spz(path: StrPath) -> CompressedScene:
         },
         antialiased=bool(header.flags & ANTIALIASED),
     )
-    if header.has_levels:
+    if arrays["tree"].size:
         scene = scene.take(np.flatnonzero(arrays["tree"].reshape(-1)[: 2 * header.count].view("<u2") == 0))
         logger.info("%s: levels of detail; the finest is read, %d of %d splats", path, len(scene), header.count)
     # Signs first, then the turn, as Niantic's library does it, which writes such files.
@@ -422,7 +417,7 @@ def read_spz(path: StrPath) -> CompressedScene:
 
 def _unpacked_means(header: SpzHeader, data: Uint8s) -> NDArray[np.floating[Any]]:
     if header.version == 1:
-        return np.ascontiguousarray(data).view("<f2")
+        return data.view("<f2")
     # Put three bytes at the top of four, then shift down with the sign.
     wide = np.zeros((header.count, 3, 4), np.uint8)
     wide[:, :, 1:] = data.reshape(header.count, 3, 3)
@@ -440,7 +435,7 @@ def _unpacked_quats(header: SpzHeader, data: Uint8s) -> Float32s:
         largest = np.full(header.count, 3)
         others = data / 127.5 - 1
     else:
-        packed = np.ascontiguousarray(data).view("<u4")
+        packed = data.view("<u4")
         parts = packed >> np.array([20, 10, 0], np.uint32) & 1023
         largest = packed[:, 0] >> 30
         others = (parts & 511) / (511 * math.sqrt(2)) * np.where(parts & 512, -1, 1)

@@ -42,7 +42,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name, matrix, side in (("K", self.K, 3), ("viewmat", self.viewmat, 4)):
-            if tuple(matrix.shape) != (side, side):
+            if matrix.shape != (side, side):
                 raise ValueError(f"Camera.{name} must have shape [{side}, {side}], got {list(matrix.shape)}")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"Camera needs at least one pixel, got {self.width}x{self.height}")

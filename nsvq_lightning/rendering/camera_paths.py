@@ -95,8 +95,8 @@ def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     ahead = np.cross(up, across)
     arms = positions - middle
     x, y = arms @ across, arms @ ahead
-    height = float(np.median(arms @ up))
-    radius = float(np.median(np.hypot(x, y)))
+    height = np.median(arms @ up)
+    radius = np.median(np.hypot(x, y))
     start, arc = _arc(np.arctan2(y, x))
     turns = 2 * math.pi * (np.arange(frames) / frames)
     if arc < math.radians(270):
@@ -230,5 +230,5 @@ def _arc(angles: Float64s) -> tuple[float, float]:
     """Start and length of the arc that angles fill: the circle without their largest gap."""
     ordered = np.sort(angles)
     gaps = np.diff(ordered, append=ordered[:1] + 2 * math.pi)
-    widest = int(np.argmax(gaps))
+    widest = np.argmax(gaps)
     return float(ordered[(widest + 1) % len(ordered)]), float(2 * math.pi - gaps[widest])

@@ -84,11 +84,11 @@ def render(
         raise ValueError(f"sh_degree must be between 0 and the stored degree {stored}, got {sh_degree}")
     means = splats.means
     behind = means.new_zeros(3) if background is None else torch.as_tensor(background).to(means)
-    if tuple(behind.shape) != (3,):
+    if behind.shape != (3,):
         raise ValueError(f"background must be one RGB colour of shape [3], got {list(behind.shape)}")
     absgrad = None
     if pixel_weights is not None:
-        if tuple(pixel_weights.shape) != (camera.height, camera.width):
+        if pixel_weights.shape != camera.size[::-1]:
             expected = [camera.height, camera.width]
             raise ValueError(f"pixel_weights must be {expected}, got {list(pixel_weights.shape)}")
         absgrad = means.new_zeros(1, 1).expand(len(means), 3).requires_grad_()

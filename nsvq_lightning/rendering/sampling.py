@@ -106,11 +106,11 @@ def fewer_cameras(cameras: Float64s) -> Float64s:
         return cameras
     positions = cameras[:, :3]
     apart = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
-    spread = float(apart.max())
-    chosen = [int(apart.argmax())]
+    spread = apart.max()
+    chosen = [apart.argmax()]
     apart = np.linalg.norm(positions - positions[chosen[0]], axis=1)
     while len(chosen) < MAX_CAMERAS and apart.max() > NEAR_ENOUGH * spread:
-        chosen.append(int(apart.argmax()))
+        chosen.append(apart.argmax())
         apart = np.minimum(apart, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
     kept: Float64s = cameras[np.sort(chosen)]
     return kept

@@ -124,7 +124,7 @@ def _codes_in_use(codes: Integers, size: int) -> Json:
 def write_csv(path: Path, rows: Rows) -> None:
     """Write rows with the same keys as CSV, atomically; the keys of the first row, in order, are the header."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    writer = csv.DictWriter(text, fieldnames=rows[0], lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     write_text(path, text.getvalue())

@@ -17,7 +17,6 @@ from typing import Any
 from unicodedata import normalize
 
 import cv2
-import numpy as np
 import torch
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from torch import Tensor
@@ -133,7 +132,7 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
             raise OSError(f"OpenCV cannot write {code} here: write PNGs into a folder")
         frames: list[object] = []
         try:
-            yield lambda rgb: frames.append(video.write(np.ascontiguousarray(rgb[:, :, ::-1])))
+            yield lambda rgb: frames.append(video.write(rgb[:, :, ::-1]))
         finally:
             video.release()
         # OpenCV itself says nothing where it could not write.

@@ -318,7 +318,7 @@ class SplatModule(LightningModule):
         loss = sum(others, start=first)
         if (self.global_step + 1) % max(1, self.trainer.log_every_n_steps) == 0:  # type: ignore[attr-defined]
             quality = psnr(eight_bit(rendered.image.detach()), eight_bit(batch.image), batch.mask).float()
-            values = {"train/loss": loss.detach(), "train/psnr": quality, "train/splats": float(len(self.splats))}
+            values = {"train/loss": loss.detach(), "train/psnr": quality, "train/splats": len(self.splats)}
             self.log_dict(values, batch_size=1)  # type: ignore[arg-type]  # a number among tensors
         late_loss = AsyncScalar(loss)
         if not late_loss.is_here:

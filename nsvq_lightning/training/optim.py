@@ -83,8 +83,8 @@ def param_groups(
         rates: Learning rates.
         extent: Extent of the scene, scene units; the position's rate is relative to it.
     """
-    parameters: dict[str, Any] = dict(splats.attributes())
-    parameters |= {codebook_group(name): quantizer.codebook for name, quantizer in quantizers.items()}
+    books = {codebook_group(name): quantizer.codebook for name, quantizer in quantizers.items()}
+    parameters = splats.attributes() | books
     return [{"params": [each], "lr": group_lr(name, rates, extent), "name": name} for name, each in parameters.items()]
 
 
@@ -130,7 +130,7 @@ def adapt_to_views(optimizer: torch.optim.Optimizer, rates: LearningRates, views
 def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
     """Adam of the paper over ``groups``: default betas, epsilon 1e-15, no weight decay; fused where torch can."""
     fused = all(group["params"][0].device.type in ("cpu", "cuda") for group in groups)
-    return torch.optim.Adam(groups, eps=EPS, fused=True if fused else None)
+    return torch.optim.Adam(groups, eps=EPS, fused=fused or None)
 
 
 def find_group(optimizer: torch.optim.Optimizer, name: str) -> dict[str, Any]:

@@ -65,13 +65,13 @@ def _step(backend: str, device: str, dtype: torch.dtype) -> dict[str, Tensor]:
     codes = (nearest if dtype == torch.float32 else nearest_reference)(quats, codebook)
     found = lookup(codebook, codes)
     (found**2).sum().backward()  # type: ignore[no-untyped-call]
-    substituted = noise_substitution(quats, codebook, codes, draw).detach()
+    substituted = noise_substitution(quats, codebook, codes, draw)
     gradients = {name: tensor.grad for name, tensor in splats._asdict().items()}
     return {
-        "image": image.detach(),
-        "loss": loss.detach(),
+        "image": image,
+        "loss": loss,
         **gradients,
-        "codes": (quats - found.detach()).norm(dim=1),
+        "codes": (quats - found).norm(dim=1),
         "noise": (substituted - quats).norm(dim=1),  # as long as the error
         "codebook": codebook.grad,
     }

@@ -71,6 +71,8 @@ def test_a_run_knows_its_cameras_without_its_photos(
     assert _run(tmp_path, "--path", "cameras", "-o", tmp_path / "frames") == 0
     expected = (render(load(tmp_path / "scene.nsvq"), cameras[4]).image.detach().clamp(0, 1) * 255).numpy()
     assert np.abs(_picture(tmp_path / "frames" / "00004.png") - expected).max() <= 0.51
+    assert _run(tmp_path, "--path", "cameras", "--frames", "3", "-o", tmp_path / "few") == 1
+    assert "cameras has frames of its own" in capsys.readouterr().err
     assert main(["view", str(tmp_path), "-o", str(tmp_path / "page.html")]) == 0
     found = page_cameras(tmp_path / "page.html")
     assert list(found) == list("<bcdefgh&")

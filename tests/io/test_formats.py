@@ -11,6 +11,7 @@ from viewer_scenes import WRITTEN, coded_scene, plain_scene
 
 from nsvq_lightning import Splats, load, save
 from nsvq_lightning.io import CompressedScene, FormatError, read_scene
+from nsvq_lightning.io.compressed import on_white
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.random import generator
 
@@ -32,9 +33,10 @@ def test_attributes_by_name_are_saved_as_they_come(tmp_path: Path) -> None:
     """As gsplat and nerfstudio have them, some as arrays, in other precisions, and with another shape of opacities."""
     splats = scene(7, 2)
     named: dict[str, Any] = {name: values.detach() for name, values in splats.attributes().items()}
-    named |= {"means": named["means"].double().numpy(), "opacities": named["opacities"][:, None]}
+    named |= {"means": named["means"].double().numpy().astype(">f8"), "opacities": named["opacities"][:, None]}
+    named |= {"quats": named["quats"].numpy()[::-1].copy()[::-1], "scales": named["scales"].tolist()}
     named |= {"features_dc": named.pop("sh0").squeeze(1), "features_rest": named.pop("shN").bfloat16()}
-    save(named, tmp_path / "a.ply")
+    save({"step": 1, "splats": named}, tmp_path / "a.ply")  # as gsplat's checkpoints have them
     found = load(tmp_path / "a.ply")
     for name, values in splats.attributes().items():
         assert torch.equal(getattr(found, name), values.bfloat16().float() if name == "shN" else values)
@@ -107,6 +109,18 @@ def test_an_origin_is_not_lost_silently(tmp_path: Path, caplog: pytest.LogCaptur
         assert caplog.text == ""
         step()
         assert "4000000.0" in caplog.text
+
+
+def test_a_white_background_is_not_lost_silently(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    black = CompressedScene.from_splats(scene(5, 1))
+    white = on_white(black)
+    save(white, tmp_path / "x.nsvq")
+    assert CompressedScene.joined([white, white]).background == (1, 1, 1)
+    assert caplog.text == ""
+    save(white, tmp_path / "x.ply")
+    assert "x.ply: that white is behind the splats is not stored" in caplog.text
+    assert not any(CompressedScene.joined([black, white]).background)
+    assert "the first decides what is behind all" in caplog.text
 
 
 @pytest.mark.parametrize("suffix", sorted(WRITTEN))

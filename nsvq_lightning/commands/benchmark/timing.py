@@ -216,7 +216,7 @@ def as_markdown(about: Sequence[str], scope: Scope, suites: Mapping[str, Sequenc
 
 def _table(rows: Sequence[Measurement]) -> str:
     """Rows of one operation; what only some of them have is empty in the others."""
-    names = list(dict.fromkeys(name for row in rows for name in row.values))
+    names = dict.fromkeys(name for row in rows for name in row.values)
     cells = []
     for row in rows:
         times = [row.median, min(row.samples), len(row.samples), row.ratio]

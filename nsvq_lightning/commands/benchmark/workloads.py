@@ -131,7 +131,7 @@ def _positions(count: int, rng: np.random.Generator) -> Float64s:
     box = rng.uniform(-0.4, 0.4, (tenth, 3))
     axis = rng.integers(0, 3, tenth)
     box[np.arange(tenth), axis] = 0.4 * (rng.integers(0, 2, tenth) * 2 - 1)
-    box += np.array([1.3, 0.5, -0.6])
+    box += [1.3, 0.5, -0.6]
     cloud = rng.normal(size=(quarter, 3)) * 0.8
     rest = count - 3 * quarter - tenth
     shell = _directions(rng, rest, 3) * rng.uniform(2.5, 3.2, (rest, 1))

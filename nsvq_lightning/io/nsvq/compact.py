@@ -25,7 +25,7 @@ import torch
 
 from nsvq_lightning.io import morton
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FEW_ROWS, FormatError, check_room
+from nsvq_lightning.io.errors import FEW_ROWS, Bytes, FormatError, check_room
 from nsvq_lightning.io.nsvq import entropy
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 from nsvq_lightning.io.nsvq.precision import MAX_OPACITY_LEVELS, Precision
@@ -93,7 +93,7 @@ def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header
     return Header.of(scene, "compact", attributes, table), streams
 
 
-def decode_compact(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene:
+def decode_compact(header: Header, streams: Mapping[str, Bytes]) -> CompressedScene:
     """Scene from header and streams.
 
     Raises:
@@ -172,7 +172,7 @@ def _encoded(attribute: Stored, order: Int64s, neighbours: Int32s) -> dict[str, 
     return streams
 
 
-def _decoded(entry: AttributeEntry, streams: Mapping[str, memoryview], near: Int32s, two: bool) -> Stored:
+def _decoded(entry: AttributeEntry, streams: Mapping[str, Bytes], near: Int32s, two: bool) -> Stored:
     """Invert :func:`_encoded`, for decisions of one context or two."""
     own = streams[entry.name]
     codebook = None

@@ -11,7 +11,7 @@ from numba import uint64
 
 from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array, check_inside
-from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.errors import Bytes, FormatError
 from nsvq_lightning.io.morton import check_depths
 from nsvq_lightning.io.nsvq import range_coder as rc
 from nsvq_lightning.splats.conventions import Int32s, Int64s, Integers, Uint32s, Uint64s
@@ -75,7 +75,7 @@ def _path_contexts(bits: int, neighbours: Int32s, two: bool) -> Uint32s:
     return rc.new_contexts((_RELATIONS + two) << min(bits, _MODELLED_BITS), rc.TWO_START * two)
 
 
-def decode_paths(data: bytes | memoryview, bits: int, neighbours: Int32s, two: bool = True) -> Int64s:
+def decode_paths(data: Bytes, bits: int, neighbours: Int32s, two: bool = True) -> Int64s:
     """Invert :func:`encode_paths` with the same ``bits`` and ``neighbours``.
 
     Args:
@@ -114,7 +114,7 @@ def encode_keys(keys: Uint64s, depths: Int64s) -> bytes:
     return _bytes(words, _write_keys(keys, depths, words, rc.new_contexts(_KEY_CONTEXTS)))
 
 
-def decode_keys(data: bytes | memoryview, depths: Int64s) -> Uint64s:
+def decode_keys(data: Bytes, depths: Int64s) -> Uint64s:
     """Invert :func:`encode_keys` with the same ``depths``.
 
     Raises:
@@ -162,7 +162,7 @@ def encode_integers(values: Integers, order: Int64s | None = None) -> bytes:
     return bytes(modes) + _bytes(words, used)
 
 
-def decode_integers(data: bytes | memoryview, rows: int, columns: int) -> Int64s:
+def decode_integers(data: Bytes, rows: int, columns: int) -> Int64s:
     """Invert :func:`encode_integers`.
 
     Raises:
@@ -191,7 +191,7 @@ def _bytes(words: Uint32s, used: int) -> bytes:
     return words[:used].astype("<u4", copy=False).tobytes()
 
 
-def _words(data: bytes | memoryview) -> Uint32s:
+def _words(data: Bytes) -> Uint32s:
     if len(data) % 4:
         raise FormatError(f"damaged: an entropy-coded stream of {len(data)} bytes, not a multiple of 4")
     return np.frombuffer(data, "<u4").astype(np.uint32, copy=False)

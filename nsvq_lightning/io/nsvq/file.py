@@ -8,7 +8,7 @@ import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, naming_file
+from nsvq_lightning.io.errors import Bytes, FormatError, naming_file
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry, frame, unframe
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, listed
@@ -69,8 +69,7 @@ def as_stored(scene: CompressedScene, storage: Storage) -> CompressedScene:
     """
     if not scene.codes:
         return scene
-    header, streams = encode(scene, storage)
-    return decode(header, {name: memoryview(data) for name, data in streams.items()})
+    return decode(*encode(scene, storage))
 
 
 def read_nsvq(path: StrPath) -> CompressedScene:
@@ -84,7 +83,7 @@ def read_nsvq(path: StrPath) -> CompressedScene:
         return replace(decode(*unframe(data)), stored_bytes=len(data))
 
 
-def decode(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene:
+def decode(header: Header, streams: Mapping[str, Bytes]) -> CompressedScene:
     """Scene from header and streams of any level.
 
     Raises:
@@ -119,7 +118,7 @@ def pack_fields(fields: Sequence[Integers], widths: Sequence[int]) -> bytes:
     return np.packbits(np.concatenate(columns, axis=1), bitorder="little").tobytes()
 
 
-def unpack_fields(data: bytes | memoryview, rows: int, widths: Sequence[int]) -> list[Uint32s]:
+def unpack_fields(data: Bytes, rows: int, widths: Sequence[int]) -> list[Uint32s]:
     """Invert :func:`pack_fields`.
 
     Args:
@@ -169,7 +168,7 @@ def encode_paper(scene: CompressedScene) -> tuple[Header, dict[str, bytes]]:
     return header, streams
 
 
-def decode_paper(header: Header, streams: Mapping[str, memoryview]) -> CompressedScene:
+def decode_paper(header: Header, streams: Mapping[str, Bytes]) -> CompressedScene:
     """Scene from header and streams.
 
     Raises:
@@ -217,5 +216,5 @@ def _possible(entry: AttributeEntry) -> bool:
     return entry.step == 0 and (raw or coded)
 
 
-def _floats(data: memoryview, rows: int, dim: int) -> Float32s:
+def _floats(data: Bytes, rows: int, dim: int) -> Float32s:
     return np.frombuffer(data, "<f4").astype(np.float32).reshape(rows, dim)

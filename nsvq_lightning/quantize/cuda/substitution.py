@@ -25,9 +25,8 @@ ARTANH = tl.constexpr((1 / 11, 1 / 9, 1 / 7, 1 / 5, 1 / 3, 1.0))
 TINY = tl.constexpr(torch.finfo(torch.float32).tiny)
 
 ROWS = tl.constexpr(16)  # rows of a code that are added up side by side
-PARTS = tl.constexpr(
-    8
-)  # most programs that share the rows of one code, so that one of very many is no long tail; a power of two
+# Most programs that share the rows of one code, so that one of very many is no long tail; a power of two.
+PARTS = tl.constexpr(8)
 PART = tl.constexpr(256)  # fewest rows of a part, but for the last one
 
 

@@ -38,14 +38,13 @@ class _Frame:
         self.group_columns, group_rows = rec.group_grid(width, height)
         self.tiles = self.group_columns * group_rows * rec.GROUP_TILES
         self.n = n = splats.means.shape[0]
-        coefficients = splats.shN.shape[1]
         shapes = ((n, *shape) for shape in attribute_shapes(sh_degree_of(splats.shN)).values())
         attributes = tuple(map(flat_checked, ATTRIBUTES, splats, shapes))
         self.geometry, self.colors = attributes[:4], attributes[4:]
-        self.bands = 3 * coefficients, degree
+        self.bands = 3 * splats.shN.shape[1], degree
         self.parts = parts_of(n, PROJECTED)
         self.work = Workspace.borrow()
-        self.records = self.work.array("records", rec.RECORD * self.n)
+        self.records = self.work.array("records", rec.RECORD * n)
         self.integers = self.records.view(np.int32)
         self.sums = np.empty(0, np.float32)
 
