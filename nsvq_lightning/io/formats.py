@@ -156,11 +156,11 @@ def format_of(path: StrPath) -> Format:
 
 # What turns files of other formats into some that are read.
 _WAYS = {
-    ".usd": usda.BINARY_REMEDY,
-    ".usdc": usda.BINARY_REMEDY,
-    ".usdz": usda.BINARY_REMEDY,
-    ".ksplat": "splat-transform (npm) converts it",
+    **dict.fromkeys((".usd", ".usdc", ".usdz"), usda.BINARY_REMEDY),
+    **dict.fromkeys((".ksplat", ".lcc", ".lcc2"), "splat-transform (npm) converts it"),
     ".gltf": "save it as .glb",
+    ".zip": "if meta.json and pictures are in it, name it .sog",
+    ".pt": "of a checkpoint of gsplat: nl.save(torch.load(FILE), 'scene.ply')",
 }
 # Formats by the end of the file's name; a new format is one more entry.
 FORMATS = {

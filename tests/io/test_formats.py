@@ -142,7 +142,16 @@ def test_splats_without_a_rotation_are_counted(tmp_path: Path, caplog: pytest.Lo
 
 
 @pytest.mark.parametrize(
-    ("name", "way"), [("a.usdz", "usdcat"), ("a.USDC", "usdcat"), ("a.ksplat", "splat-transform"), ("a.gltf", ".glb")]
+    ("name", "way"),
+    [
+        ("a.usdz", "usdcat"),
+        ("a.USDC", "usdcat"),
+        ("a.ksplat", "splat-transform"),
+        ("a.lcc", "splat-transform"),
+        ("a.gltf", "as .glb"),
+        ("a.zip", "name it .sog"),
+        ("a.pt", "torch.load"),
+    ],
 )
 def test_what_turns_other_files_into_some_that_are_read_is_said(name: str, way: str) -> None:
     with pytest.raises(ValueError, match=rf"unknown suffix .*; .*{way}"):
