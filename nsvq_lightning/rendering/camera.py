@@ -18,7 +18,7 @@ class Camera:
     """Pinhole camera in COLMAP's conventions: x right, y down, z forward; pixel centres at .5.
 
     Attributes:
-        K: Intrinsics ``[3, 3]`` in pixels, principal point included; skew must be 0.
+        K: Intrinsics ``[3, 3]`` in pixels, principal point included; skew must be 0. Arrays and lists become tensors.
         viewmat: World to camera, rigid, ``[4, 4]``, scene units.
         width: Image width in pixels.
         height: Image height in pixels.
@@ -28,8 +28,8 @@ class Camera:
             machine.
 
     Raises:
-        ValueError: A matrix has another shape or kind, the image is empty, the focal lengths are not finite or below
-            :data:`MIN_FOCAL`, or ``near`` is not positive and finite.
+        ValueError: A matrix has another shape or kind, or requires a gradient; the image is empty, the focal lengths
+            are not finite or below :data:`MIN_FOCAL`, or ``near`` is not positive and finite.
     """
 
     K: Tensor
@@ -41,13 +41,13 @@ class Camera:
     packed_view: tuple[float, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        for name, matrix, side in (("K", self.K, 3), ("viewmat", self.viewmat, 4)):
-            if matrix.shape != (side, side):
-                raise ValueError(f"Camera.{name} must have shape [{side}, {side}], got {list(matrix.shape)}")
+        for name, side in (("K", 3), ("viewmat", 4)):
+            matrix = vars(self)[name] = torch.as_tensor(getattr(self, name))
+            if matrix.requires_grad or matrix.shape != (side, side):  # rendering has no gradient by cameras
+                raise ValueError(f"Camera.{name} must be detached, of shape [{side}, {side}], got {list(matrix.shape)}")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"Camera needs at least one pixel, got {self.width}x{self.height}")
-        K = self.K.tolist()
-        (fx, _, cx), (_, fy, cy), _ = K
+        (fx, _, cx), (_, fy, cy), _ = K = self.K.tolist()
         # Kept as Python floats: reading them from an accelerator would stall it at every render.
         intrinsics = fx, fy, cx, cy
         turn = self.viewmat.detach().to("cpu", torch.float64, copy=True)

@@ -1,5 +1,8 @@
 """A camera is packed once, when it is made, wherever that is."""
 
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
 
@@ -29,3 +32,16 @@ def test_a_moved_camera_keeps_its_numbers() -> None:
     assert wide.K.dtype == wide.viewmat.dtype == torch.float64
     assert (wide.packed_view, wide.intrinsics) == (camera.packed_view, camera.intrinsics)
     assert camera.K.dtype == torch.float32
+
+
+@pytest.mark.parametrize("matrices", [(K.numpy(), np.eye(4)), (K.tolist(), np.eye(4).tolist())])
+def test_arrays_and_lists_are_cameras_as_tensors_are(matrices: Any) -> None:
+    camera = Camera(*matrices, 40, 30)
+    assert camera.packed_view == Camera(K, torch.eye(4), 40, 30).packed_view
+    assert torch.equal(camera.to("cpu", torch.float32).K, K)
+
+
+def test_a_pose_that_asks_for_a_gradient_is_refused() -> None:
+    """It would get none, without a word."""
+    with pytest.raises(ValueError, match=r"Camera\.viewmat must be detached, of shape \[4, 4\]"):
+        Camera(K, torch.eye(4).requires_grad_(), 40, 30)
