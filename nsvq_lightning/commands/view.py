@@ -108,20 +108,20 @@ def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     """Cameras of the photos, or guessed ones."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.data.scene import spread
-    from nsvq_lightning.io.formats import load
+    from nsvq_lightning.io.formats import read_scene
     from nsvq_lightning.report.viewer import MAX_CAMERAS
 
     # What a run has recorded are its own, and need no look at the scene.
     is_own = options.root is None and (options.scene / "viewer.html").is_file()
-    splats = None if options.live or is_own else load(file)
-    means = None if splats is None else splats.means.detach().numpy()
-    cameras, _ = known_views(options.scene, options.root, means)
+    scene = None if options.live or is_own else read_scene(file)
+    cameras, _ = known_views(options.scene, options.root, None if scene is None else scene.means)
     if cameras:
         return dict(spread(list(cameras.items()), MAX_CAMERAS))
     if options.live:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
     sys.stderr.write("no photos: cameras are guessed from the scene; --data.root names the folder of the photos\n")
-    return {f"guess {index}": camera for index, camera in enumerate(likely_cameras(splats or load(file), 12), 1)}
+    guesses = likely_cameras((scene or read_scene(file)).decode(), 12)
+    return {f"guess {index}": camera for index, camera in enumerate(guesses, 1)}
 
 
 class _Server(ThreadingHTTPServer):

@@ -56,8 +56,9 @@ def load(path: StrPath) -> "Splats":
         FileNotFoundError: No such file.
     """
     scene = read_scene(path)
-    if any(scene.origin):
-        logger.warning("%s: positions are relative to %s in the world: read_nsvq(path).origin", path, scene.origin)
+    if any((*scene.origin, *scene.background, scene.antialiased)):
+        facts = f"origin {scene.origin}, background {scene.background}, antialiased {scene.antialiased}"
+        logger.warning("%s: its splats alone do not say %s: read_scene(path) does", path, facts)
     return scene.decode()
 
 
@@ -100,10 +101,8 @@ def save(scene: "AnySplats", path: StrPath, storage: Storage | None = None, **op
         raise ValueError(f"cannot write {path}: {suffix_of(path)} is only read")
     with naming_file(path):
         scene = CompressedScene.from_splats(scene).finite()
-    if any(scene.origin) and not entry.native:
-        logger.warning("%s: the origin %s of the positions is not stored; add it in the viewer", path, scene.origin)
-    if any(scene.background) and not entry.native:
-        logger.warning("%s: that white is behind the splats is not stored; set it in the viewer", path)
+    if any((*scene.origin, *scene.background)) and not entry.native:
+        logger.warning(f"{path}: not stored: origin {scene.origin}, background {scene.background}; set in the viewer")
     if entry.native:
         options["storage"] = storage
     elif storage is not None:

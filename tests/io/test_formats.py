@@ -118,7 +118,10 @@ def test_a_white_background_is_not_lost_silently(tmp_path: Path, caplog: pytest.
     assert CompressedScene.joined([white, white]).background == (1, 1, 1)
     assert caplog.text == ""
     save(white, tmp_path / "x.ply")
-    assert "x.ply: that white is behind the splats is not stored" in caplog.text
+    assert "x.ply: not stored: origin (0.0, 0.0, 0.0), background (1.0, 1.0, 1.0)" in caplog.text
+    caplog.clear()
+    load(tmp_path / "x.nsvq")
+    assert "its splats alone do not say origin (0.0, 0.0, 0.0), background (1.0, 1.0, 1.0)" in caplog.text
     assert not any(CompressedScene.joined([black, white]).background)
     assert "the first decides what is behind all" in caplog.text
 

@@ -34,9 +34,9 @@ def test_a_moved_camera_keeps_its_numbers() -> None:
     assert camera.K.dtype == torch.float32
 
 
-@pytest.mark.parametrize("matrices", [(K.numpy(), np.eye(4)), (K.tolist(), np.eye(4).tolist())])
-def test_arrays_and_lists_are_cameras_as_tensors_are(matrices: Any) -> None:
-    camera = Camera(*matrices, 40, 30)
+@pytest.mark.parametrize(("matrix", "pose"), [(K.numpy(), np.eye(4)), (K.tolist(), np.eye(4).tolist())])
+def test_arrays_and_lists_are_cameras_as_tensors_are(matrix: Any, pose: Any) -> None:
+    camera = Camera(matrix, pose, 40, 30)
     assert camera.packed_view == Camera(K, torch.eye(4), 40, 30).packed_view
     assert torch.equal(camera.to("cpu", torch.float32).K, K)
 
