@@ -112,7 +112,7 @@ class CompressedScene:
 
         Args:
             splats: The splats, or their attributes by their names here or in nerfstudio, tensors or arrays of any
-                numbers; a compressed scene is returned as it is.
+                numbers, or a checkpoint of gsplat with these; a compressed scene is returned as it is.
             header: ``antialiased``, ``metrics`` and ``origin``; or ``config``.
 
         Raises:

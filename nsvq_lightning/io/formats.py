@@ -58,7 +58,7 @@ def load(path: StrPath) -> "Splats":
     scene = read_scene(path)
     if any((*scene.origin, *scene.background, scene.antialiased)):
         facts = f"origin {scene.origin}, background {scene.background}, antialiased {scene.antialiased}"
-        logger.warning("%s: its splats alone do not say %s: read_scene(path) does", path, facts)
+        logger.warning("%s: its splats alone do not say %s: nsvq_lightning.io.read_scene does", path, facts)
     return scene.decode()
 
 

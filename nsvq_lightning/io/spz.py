@@ -394,7 +394,8 @@ def read_spz(path: StrPath) -> CompressedScene:
     degree = min(header.sh_degree, 3)
     if header.sh_degree > degree:
         logger.warning("%s: of SH degree %d, degrees up to %d are read", path, header.sh_degree, degree)
-    factor = np.uint8(2 if arrays["tree"].size else 1)  # a splat that stands for several may be above 1
+    factor = 2 if arrays["tree"].size else 1  # a splat that stands for several may be above 1
+    levels = np.minimum(arrays["opacities"].astype(np.uint16) * factor, 255).astype(np.uint8)
     system = header.system or _SYSTEMS.index(DEFAULT_AXES.upper()) + 1
     xyz, quats, harmonics = _signs(_SYSTEMS[(system - 1) % 8], degree)
     scene = CompressedScene.from_rows(
@@ -402,7 +403,7 @@ def read_spz(path: StrPath) -> CompressedScene:
             "means": _unpacked_means(header, arrays["means"]) * xyz,
             "quats": _unpacked_quats(header, arrays["quats"]) * quats,
             "scales": arrays["scales"].astype(np.float32) / 16 - 10,
-            "opacities": logits_of_bytes(np.minimum(arrays["opacities"], 255 // factor) * factor),
+            "opacities": logits_of_bytes(levels),
             "sh0": ((np.arange(256) / 255 - 0.5) / _COLOR).astype(np.float32)[arrays["sh0"]],
             "shN": _unpacked_harmonics(arrays["shN"], harmonics),
         },

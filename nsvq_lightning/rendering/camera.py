@@ -50,7 +50,7 @@ class Camera:
         (fx, _, cx), (_, fy, cy), _ = K = self.K.tolist()
         # Kept as Python floats: reading them from an accelerator would stall it at every render.
         intrinsics = fx, fy, cx, cy
-        turn = self.viewmat.detach().to("cpu", torch.float64, copy=True)
+        turn = self.viewmat.to("cpu", torch.float64, copy=True)
         *rows, _ = turn.tolist()
         rotation, translation = [row[:3] for row in rows], [row[3] for row in rows]
         position = [-sum(row[k] * t for row, t in zip(rotation, translation, strict=True)) for k in range(3)]

@@ -134,18 +134,21 @@ def test_flags_that_are_not_known_are_told(tmp_path: Path, caplog: pytest.LogCap
 def test_of_levels_of_detail_the_finest_is_read(tmp_path: Path) -> None:
     """Spark's flag 0x80: numbers of children and first children behind the arrays, opacities in halves of 255ths."""
     save(plain_scene(9, 1), tmp_path / "a.spz", axes="rub")
-    plain = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    plain = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
+    opacities = slice(16 + 9 * 9, 16 + 9 * 10)
+    plain[opacities.stop - 1] = 255  # which becomes 128: 1 lies between 127 and 128
+    (tmp_path / "a.spz").write_bytes(gzip.compress(plain))
     start = 16 + 9 * (20 + 9)  # of the extension
     tree = np.array([2, 2, 5] + [0] * 6, "<u2").tobytes() + np.array([1, 3, 4] + [0] * 6, "<u4").tobytes()
     changed = bytearray(plain[:start] + tree + plain[start:])
     changed[14] |= 0x80
-    opacities = slice(16 + 9 * 9, 16 + 9 * 10)
-    changed[opacities] = [level // 2 for level in changed[opacities]]
+    changed[opacities] = [(level + 1) // 2 for level in changed[opacities]]
     (tmp_path / "b.spz").write_bytes(gzip.compress(changed))
     whole, finest = read_scene(tmp_path / "a.spz"), read_scene(tmp_path / "b.spz")
     np.testing.assert_array_equal(finest.means, whole.means[3:])
     np.testing.assert_array_equal(finest.values("shN"), whole.values("shN")[3:])
     np.testing.assert_allclose(sigmoid(finest.opacities), sigmoid(whole.opacities[3:]), atol=1.01 / 255)
+    assert finest.opacities[-1] == whole.opacities[-1]
 
     (tmp_path / "b.spz").write_bytes(gzip.compress(changed[: start + 50]))
     with pytest.raises(FormatError, match="truncated: tree of 9 splats has 50 of 54 bytes"):
