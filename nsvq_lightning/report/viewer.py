@@ -24,7 +24,6 @@ from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.splats.splats import SplatTensors
 
-Color = Sequence[float]  # RGB in [0, 1]
 _LENS = ("fx", "fy", "cx", "cy")
 # File whose time of modification says when a viewer last asked.
 REQUEST = "live.request"
@@ -39,9 +38,7 @@ def some_cameras(scene: Scene) -> dict[str, Camera]:
     return dict(spread(list(zip(scene.names, scene.cameras, strict=True)), MAX_CAMERAS))
 
 
-def write_viewer(
-    path: StrPath, scene_file: StrPath, cameras: Mapping[str, Camera], title: str, background: Color | None = None
-) -> int:
+def write_viewer(path: StrPath, scene_file: StrPath, cameras: Mapping[str, Camera], title: str) -> int:
     """Write a page that holds a ``.nsvq`` file, its reader, a renderer and cameras; it loads nothing from elsewhere.
 
     It orbits about the direction that is up for the cameras (:func:`nsvq_lightning.rendering.camera.up_of`).
@@ -52,34 +49,26 @@ def write_viewer(
         cameras: At least one, by name; the page starts at the :func:`best_view`. They have the coordinates of the
             file's positions.
         title: Name of the scene, plain text.
-        background: RGB in [0, 1] behind the splats; that of the scene by default.
 
     Returns:
         Bytes of the page.
 
     Raises:
         FormatError: ``scene_file`` is damaged or not a ``.nsvq`` file.
-        ValueError: There are no cameras, or ``background`` is no colour.
+        ValueError: There are no cameras.
     """
-    page = viewer_page(scene_file, cameras, title, background)
+    page = viewer_page(scene_file, cameras, title)
     write_text(path, page)
     return len(page.encode())
 
 
-def viewer_page(
-    scene_file: StrPath,
-    cameras: Mapping[str, Camera],
-    title: str,
-    background: Color | None = None,
-    live: float | None = None,
-) -> str:
+def viewer_page(scene_file: StrPath, cameras: Mapping[str, Camera], title: str, live: float | None = None) -> str:
     """The page of :func:`write_viewer`; arguments and errors are the same.
 
     Args:
         scene_file: See there; with ``live``, it may be yet to come, and the page then starts at the first camera.
         cameras: See there.
         title: See there.
-        background: See there.
         live: None for a page that holds the file. Another one asks its server for ``scene.nsvq``, and after so many
             seconds for ``version`` again, to show a new one; 0 for never.
     """
@@ -87,14 +76,12 @@ def viewer_page(
         raise ValueError("a page needs at least one camera to start from, got none")
     about = ""
     start = 0
-    behind = (0.0, 0.0, 0.0) if background is None else background
+    behind = 0.0, 0.0, 0.0
     if live is None or Path(scene_file).is_file():
         stored = read_nsvq(scene_file)
-        behind = stored.background if background is None else background
+        behind = stored.background
         about = f"{len(stored):,} splats, {(stored.stored_bytes or 0) / 1e6:.2f} MB. "
         start = best_view(stored.tensors(), list(cameras.values()))
-    if len(behind) != 3 or not all(0 <= value <= 1 for value in behind):
-        raise ValueError(f"background must be three numbers from 0 to 1, got {list(behind)}")
     if live is None:
         file = base64.b64encode(Path(scene_file).read_bytes()).decode()
         source = f'<script id="file" type="text/plain">{file}</script>'
