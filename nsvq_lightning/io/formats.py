@@ -73,7 +73,7 @@ def read_scene(path: StrPath) -> CompressedScene:
     return replace(kept, stored_bytes=scene.stored_bytes or path.stat().st_size)
 
 
-def save(scene: "AnySplats", path: StrPath, storage: Storage | None = None, **options: Any) -> int:
+def save(scene: "AnySplats", path: StrPath, storage: Storage | str | None = None, **options: Any) -> int:
     """Save a scene in any supported format; splats with NaN or infinite values are left out with a warning.
 
     Args:
@@ -81,8 +81,8 @@ def save(scene: "AnySplats", path: StrPath, storage: Storage | None = None, **op
             :meth:`CompressedScene.from_splats`. A :class:`CompressedScene` keeps its codebooks where the
             format has them: all of them in ``.nsvq``, that of the spherical harmonics in ``.sog``.
         path: File to write, replaced atomically; its suffix selects the format.
-        storage: Level and precision of ``.nsvq``. For another format, the file then holds what the ``.nsvq`` file
-            would decode to, so that all files of a run hold the same splats.
+        storage: Level and precision of ``.nsvq``, or the level alone, a word. For another format, the file then holds
+            what the ``.nsvq`` file would decode to, so that all files of a run hold the same splats.
         options: For ``.sog``: ``palette`` (most rows of the palette for spherical harmonics without a codebook, default
             65536). For ``.spz``: ``version`` (3 or 4, default 3) and ``axes`` (``rdf``, those of ``.ply``
             and the default, or ``rub``). For ``lod-meta.json``: ``coarser`` (scenes of the coarser levels).
@@ -91,7 +91,7 @@ def save(scene: "AnySplats", path: StrPath, storage: Storage | None = None, **op
         Bytes of the file, or of all files of a folder.
 
     Raises:
-        ValueError: Unknown suffix, or one that is only read.
+        ValueError: Unknown suffix, or one that is only read; unknown level.
         FormatError: The scene has no finite splat.
         TypeError: The format has no such option.
     """
@@ -103,6 +103,7 @@ def save(scene: "AnySplats", path: StrPath, storage: Storage | None = None, **op
         scene = CompressedScene.from_splats(scene).finite()
     if any((*scene.origin, *scene.background)) and not entry.native:
         logger.warning(f"{path}: not stored: origin {scene.origin}, background {scene.background}; set in the viewer")
+    storage = Storage(storage) if isinstance(storage, str) else storage
     if entry.native:
         options["storage"] = storage
     elif storage is not None:

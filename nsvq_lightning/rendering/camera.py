@@ -3,6 +3,7 @@
 import math
 from copy import copy
 from dataclasses import dataclass, field
+from numbers import Integral
 
 import torch
 from torch import Tensor
@@ -45,8 +46,8 @@ class Camera:
             matrix = vars(self)[name] = torch.as_tensor(getattr(self, name))
             if matrix.requires_grad or matrix.shape != (side, side):  # rendering has no gradient by cameras
                 raise ValueError(f"Camera.{name} must be detached, of shape [{side}, {side}], got {list(matrix.shape)}")
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"Camera needs at least one pixel, got {self.width}x{self.height}")
+        if not all(isinstance(side, Integral) and side > 0 for side in self.size):
+            raise ValueError(f"Camera needs whole numbers of pixels, at least one, got {self.width}x{self.height}")
         (fx, _, cx), (_, fy, cy), _ = K = self.K.tolist()
         # Kept as Python floats: reading them from an accelerator would stall it at every render.
         intrinsics = fx, fy, cx, cy

@@ -76,6 +76,7 @@ def render(
         ValueError: Unknown back-end, or a back-end that cannot take the device or type of the splats; attributes that
             differ in device or type, or whose shapes do not fit; ``sh_degree`` above the stored degree; a background
             that is not ``[3]``; pixel weights that is not ``[H, W]``; sampling of other splats, or not above 0.
+        TypeError: ``splats`` has no such tensors, as a dictionary or a compressed scene.
     """
     splats = _checked(splats)
     stored = sh_degree_of(splats.shN)
@@ -124,6 +125,9 @@ def _sampling(means: Tensor, camera: Camera, sampling: Sampling | Tensor | float
 
 def _checked(splats: SplatTensors) -> RawSplats:
     """The attributes, contiguous; refuses those of another dtype or on another device than the means."""
+    if not all(isinstance(getattr(splats, name, None), Tensor) for name in ATTRIBUTES):
+        ways = "of a dictionary Splats.from_tensors(**it), of a CompressedScene its decode()"
+        raise TypeError(f"splats must be Splats or others with tensors of their names, got {type(splats)}: {ways}")
     tensors = {name: getattr(splats, name).contiguous() for name in ATTRIBUTES}
     check_shapes(tensors)
     kinds = {name: (tensor.dtype, tensor.device) for name, tensor in tensors.items()}

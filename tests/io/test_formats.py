@@ -10,7 +10,7 @@ import torch
 from viewer_scenes import WRITTEN, coded_scene, plain_scene
 
 from nsvq_lightning import Splats, load, save
-from nsvq_lightning.io import CompressedScene, FormatError, read_scene
+from nsvq_lightning.io import CompressedScene, FormatError, describe, read_scene
 from nsvq_lightning.io.compressed import on_white
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.random import generator
@@ -50,6 +50,10 @@ def test_options_reach_the_format(tmp_path: Path) -> None:
     assert save(splats, tmp_path / "few.sog", palette=8) < save(splats, tmp_path / "all.sog")
     with pytest.raises(TypeError, match="palette"):
         save(splats, tmp_path / "x.nsvq", palette=8)
+    save(splats, tmp_path / "paper.nsvq", storage="paper")
+    assert describe(tmp_path / "paper.nsvq")["format"] == "nsvq, level paper"
+    with pytest.raises(ValueError, match="unknown compression level 'zip'; there are compact, paper"):
+        save(splats, tmp_path / "x.nsvq", storage="zip")
 
 
 def test_unknown_suffix_lists_what_is_supported(tmp_path: Path) -> None:

@@ -41,6 +41,12 @@ def test_arrays_and_lists_are_cameras_as_tensors_are(matrix: Any, pose: Any) -> 
     assert torch.equal(camera.to("cpu", torch.float32).K, K)
 
 
+def test_sizes_are_whole_numbers_of_any_kind() -> None:
+    assert Camera(K, torch.eye(4), np.int64(40), np.int32(30)).size == (40, 30)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"whole numbers of pixels, at least one, got 40\.0x30"):
+        Camera(K, torch.eye(4), 40.0, 30)  # type: ignore[arg-type]
+
+
 def test_a_pose_that_asks_for_a_gradient_is_refused() -> None:
     """It would get none, without a word."""
     with pytest.raises(ValueError, match=r"Camera\.viewmat must be detached, of shape \[4, 4\]"):

@@ -237,7 +237,7 @@ def test_cameras_of_inrias_trainer_have_the_size_it_trained(
         ({"position": [0, 1e300, 0]}, "not a rotation and a position"),
         ({"position": [0, "x", 0]}, "could not convert"),
         ({"width": 10**9}, "a picture of 1000000000x"),
-        ({"height": 0}, "at least one pixel"),
+        ({"height": 0}, "numbers of pixels, at least one"),
         ({"fx": 0}, "positive, finite focal lengths"),
         ({"fx": 0.1}, "finite focal lengths and a centre, in pixels, got .0.1"),
         ({"fx": None}, "float"),

@@ -11,6 +11,7 @@ from oracle import run
 from splat_scenes import front_camera, random_splats, some_pixel_weights, uneven_splats
 
 from nsvq_lightning.compute.devices import _warn_of_plain_torch, resolve_backend
+from nsvq_lightning.io import CompressedScene
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import rasterizer
 from nsvq_lightning.rendering.cpu.records import MAX_SIDE
@@ -270,6 +271,14 @@ def test_attributes_that_do_not_belong_together_are_refused(name: str) -> None:
             function(splats._replace(**{name: getattr(splats, name).double()}), camera)
         with pytest.raises(ValueError, match=f"{name} must have shape"):
             function(splats._replace(**{name: getattr(splats, name)[:5]}), camera)
+
+
+def test_what_has_no_tensors_is_refused_with_a_way() -> None:
+    splats, camera = random_splats(20), front_camera()
+    for other in (splats._asdict(), CompressedScene.from_splats(splats), None):
+        for function in (render, visible):
+            with pytest.raises(TypeError, match=r"must be Splats .* got .*: of a dictionary Splats.from_tensors"):
+                function(other, camera)  # type: ignore[arg-type]
 
 
 def test_cameras_that_no_back_end_renders_are_refused() -> None:
