@@ -18,7 +18,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, Json, check_room, json_object, naming_file, wrong_start
 from nsvq_lightning.io.numbers import finite_logs, logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, moved, rotated
-from nsvq_lightning.splats.conventions import SH_C0, Float32s, Float64s, sh_coefficients, unit
+from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s, sh_coefficients, unit
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ def _harmonic(number: int) -> str:
 
 
 _FLOAT, _BYTE, _ARRAY_BUFFER = 5126, 5121, 34962
-_COMPONENTS = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
+_COMPONENTS = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", _FLOAT: "<f4"}
 
 
 def write_glb(path: StrPath, scene: CompressedScene) -> int:
@@ -202,12 +202,12 @@ def _splats(document: Json, data: memoryview, primitive: Json) -> CompressedScen
     if len(names) > len(given):
         log.warning("attributes have the names of a draft of %s, such as _ROTATION", EXTENSION)
 
-    def values(name: str) -> Float32s:
+    def values(name: str) -> Arrays:
         if name not in names:
             raise FormatError(f"splats without the attribute {name}")
         return _accessor(document, data, names[name])
 
-    degree = max((degree for degree in range(4) if _harmonic((degree + 1) ** 2 - 1) in names), default=0)
+    degree = max((int(number**0.5) for number in range(16) if _harmonic(number) in names), default=0)
     rows = {
         "means": values("POSITION"),
         "quats": values(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
@@ -226,10 +226,11 @@ def _splats(document: Json, data: memoryview, primitive: Json) -> CompressedScen
         rows["shN"] = np.concatenate(higher, axis=1)
     extras = document["asset"].get("extras")
     antialiased = isinstance(extras, dict) and extras.get("antialiased") is True
-    return CompressedScene.from_rows(rows, antialiased=antialiased)
+    points = _accessor(document, data, primitive["indices"])[:, 0] if "indices" in primitive else slice(None)
+    return CompressedScene.from_rows(rows, antialiased=antialiased).take(points)
 
 
-def _logs_of_scale(scale: Float32s) -> Float32s:
+def _logs_of_scale(scale: Arrays) -> Float32s:
     """Logarithms ``[N, 3]`` of what SCALE holds: lengths, or, until the middle of 2026, their logarithms."""
     if not (scale < 0).any():
         return logs_of_lengths(scale)
@@ -237,8 +238,8 @@ def _logs_of_scale(scale: Float32s) -> Float32s:
     return finite_logs(scale)
 
 
-def _accessor(document: Json, data: memoryview, number: int) -> Float32s:
-    """Rows ``[N, D]`` of an accessor."""
+def _accessor(document: Json, data: memoryview, number: int) -> Arrays:
+    """Rows ``[N, D]`` of an accessor, whole numbers where the file has them."""
     accessor = document["accessors"][number]
     view = document["bufferViews"][accessor["bufferView"]]
     if packed := view.get("extensions"):
@@ -255,7 +256,7 @@ def _accessor(document: Json, data: memoryview, number: int) -> Float32s:
         raise ValueError(f"accessor {number} is out of range")
     if start + (count - 1) * stride + row > len(data):
         raise FormatError(f"truncated: accessor {number} ends beyond the file")
-    rows = np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize)).astype(np.float32)
+    rows = np.array(np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize)))
     if dtype.kind != "f" and accessor.get("normalized"):
         rows = np.maximum(rows / np.iinfo(dtype).max, -1)
     return rows

@@ -250,8 +250,9 @@ def _needed(header: PlyHeader, sh_degree: int) -> dict[str, list[str]]:
 
 def _coefficients(colors: Float32s, is_float: bool) -> Float32s:
     """SH coefficients of colours: floats to 1, or whole numbers to 255 or 65535, as the numbers themselves tell."""
-    full = 255 if colors.max(initial=0) <= 255 else 65535
-    if is_float and len(colors) and np.quantile(colors, 0.9) <= 1:
+    finite = colors[np.isfinite(colors)]
+    full = 255 if finite.max(initial=0) <= 255 else 65535
+    if is_float and len(finite) and np.quantile(finite, 0.9) <= 1:
         full = 1
     return ((colors / full - 0.5) / SH_C0).astype(np.float32)
 

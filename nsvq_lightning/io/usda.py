@@ -22,6 +22,8 @@ _ROWS = 1 << 12
 BINARY_REMEDY = "write it as text: usdcat -o scene.usda FILE"
 PRIM = "ParticleField3DGaussianSplat"
 _COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
+# Strings and comments.
+_WORDS = re.compile(r"""(\"{3}|'{3}|["'])(?:\\.|.)*?\1|\#[^\n]*""", re.DOTALL)
 
 
 def write_usda(path: StrPath, scene: CompressedScene) -> int:
@@ -80,25 +82,29 @@ def read_usda(path: StrPath) -> CompressedScene:
             raise FormatError("binary OpenUSD (.usdc or .usdz); only text is read", BINARY_REMEDY)
         if not data.startswith(b"#usda"):
             raise wrong_start(".usda", data, b"#usda")
-        text = data.decode("utf-8", "replace")
-        if (prims := len(re.findall(rf"\bdef\s+{PRIM}\b", text))) != 1:
-            raise FormatError(f"{prims} prims of the kind {PRIM}, not one", "export it anew with one")
+        # No comments, and no strings but a letter, as of an axis: both may say anything.
+        text = _WORDS.sub(lambda found: found[0] * (len(found[0]) == 3), data.decode("utf-8", "replace"))
+        about, *prims = re.split(r"\b(?:def|over|class)\s+", text)
+        own = [prim for prim in prims if re.match(rf"{PRIM}\b", prim)]
+        if len(own) != 1:
+            raise FormatError(f"{len(own)} prims of the kind {PRIM}, not one", "export it anew with one")
         if "xformOp:" in text:
             raise FormatError("it has transforms (xformOp), which are not read", "export it anew, flattened")
-        if ".timeSamples" in text:
+        prim = own[0]
+        if ".timeSamples" in prim:
             log.warning("%s changes with time: the first sample is read", path)
         rows = {
-            "means": _rows(text, "positions", 3),
-            "opacities": logits_of(_rows(text, "opacities", 1)),
-            "scales": logs_of_lengths(_rows(text, "scales", 3)),
-            "quats": _rows(text, "orientations", 4),
+            "means": _rows(prim, "positions", 3),
+            "opacities": logits_of(_rows(prim, "opacities", 1)),
+            "scales": logs_of_lengths(_rows(prim, "scales", 3)),
+            "quats": _rows(prim, "orientations", 4),
         }
-        colors = _rows(text, _COEFFICIENTS, 3)
+        colors = _rows(prim, _COEFFICIENTS, 3)
         try:
             colors = colors.reshape(len(rows["means"]), -1)
             rows |= {"sh0": colors[:, :3], "shN": colors[:, 3:]}
-            scene = CompressedScene.from_rows(rows, antialiased="bool antialiased = 1" in text)
-            return rotated(scene, _to_ours(text))
+            scene = CompressedScene.from_rows(rows, antialiased="bool antialiased = 1" in prim)
+            return rotated(scene, _to_ours(about))
         except ValueError as error:
             raise FormatError(f"truncated or damaged: {error}") from None
 
@@ -119,7 +125,7 @@ def _rows(text: str, name: str, width: int) -> Float32s:
 def _to_ours(text: str) -> Float64s:
     """What takes the axes and the unit of the stage to ours, and to metres where it states a unit ``[3, 3]``."""
     turn = HALF_TURN
-    if re.search(r'\bupAxis\s*=\s*"Z"', text):
+    if re.search(r"\bupAxis\s*=\s*.Z", text):
         turn = HALF_TURN @ UP_AXES["z"]
     found = re.search(r"\bmetersPerUnit\s*=\s*([-+.\deE]+)", text)
     return turn * float(found[1]) if found else turn

@@ -128,13 +128,17 @@ def test_nodes_put_splats_in_their_place_and_small_numbers_are_read(tmp_path: Pa
             "by EXT_meshopt_compression",
         ),
         (
+            lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_2"),
+            f"without the attribute {NAME}:SH_DEGREE_1_COEF_2",
+        ),
+        (
             lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop(f"{NAME}:SCALE"),
             f"without the attribute {NAME}:SCALE",
         ),
     ],
 )
 def test_what_is_not_read_is_said(tmp_path: Path, change: Any, message: str) -> None:
-    save(plain_scene(20, 0), tmp_path / "x.glb")
+    save(plain_scene(20, 1), tmp_path / "x.glb")
     document, data = parts(tmp_path / "x.glb")
     change(document)
     with pytest.raises(FormatError, match=message) as caught:
@@ -214,6 +218,27 @@ def test_whole_numbers_are_fractions_only_where_that_is_said(tmp_path: Path, nor
     data = replaced(document, data, f"{NAME}:SCALE", lengths, componentType=5120, normalized=normalized)
     back = read_scene(write(tmp_path / "y.glb", document, data))
     np.testing.assert_allclose(np.exp(back.values("scales")), lengths / unit, rtol=1e-5)
+
+
+def test_a_primitive_with_indices_is_those_points(tmp_path: Path) -> None:
+    save(plain_scene(20, 1), tmp_path / "x.glb")
+    document, data = parts(tmp_path / "x.glb")
+    indices = np.array([7, 3, 3, 19], "<u4")
+    document["meshes"][0]["primitives"][0]["indices"] = len(document["accessors"])
+    document["accessors"].append(
+        {"bufferView": len(document["bufferViews"]), "count": 4, "type": "SCALAR", "componentType": 5125}
+    )
+    document["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": 16})
+    document["buffers"][0]["byteLength"] = len(data) + 16
+    back, whole = (
+        read_scene(write(tmp_path / "y.glb", document, data + indices.tobytes())),
+        read_scene(tmp_path / "x.glb"),
+    )
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        np.testing.assert_array_equal(back.values(name), whole.values(name)[indices], err_msg=name)
+    beyond = data + np.array([7, 3, 3, 20], "<u4").tobytes()
+    with pytest.raises(FormatError, match="index 20 is out of bounds"):
+        read_scene(write(tmp_path / "y.glb", document, beyond))
 
 
 def test_linear_light_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

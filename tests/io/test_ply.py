@@ -272,6 +272,17 @@ def test_colours_stand_in_for_coefficients(tmp_path: Path, kind: str, full: int)
     np.testing.assert_allclose(0.5 + read.values("sh0")[:, 0] / np.sqrt(4 * np.pi), colors, atol=1e-6)
 
 
+@pytest.mark.parametrize("strange", [np.nan, np.inf, -np.inf])
+def test_one_strange_colour_changes_no_other(tmp_path: Path, strange: float) -> None:
+    splats = scene(4, 0)
+    columns = {name: np.array([_values(splats, row)[name] for row in range(4)], "<f4") for name in _names(0)}
+    for name in ("f_dc_0", "f_dc_1", "f_dc_2"):
+        del columns[name]
+    columns |= {name: np.array([0.9, 0.9, strange, 0.9], "<f4") for name in ("red", "green", "blue")}
+    read = _columns(tmp_path / "x.ply", columns)
+    np.testing.assert_allclose(0.5 + read.values("sh0")[[0, 1, -1], 0] / np.sqrt(4 * np.pi), 0.9, atol=1e-6)
+
+
 def test_half_precision(tmp_path: Path) -> None:
     splats = scene(4, 0)
     columns = {name: np.array([_values(splats, row)[name] for row in range(4)], "<f2") for name in _names(0)}

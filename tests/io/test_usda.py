@@ -71,7 +71,23 @@ def _sampled(text: str) -> str:
     return re.sub(r"(positions|scales) = (\[[^\]]*\])", r"\1.timeSamples = { 0.5: \2, 1: [(9, 9, 9)], }", text)
 
 
-@pytest.mark.parametrize("change", [_squeezed, _half, _sampled])
+def _beside_others(text: str) -> str:
+    """Numbers of other prims, and words that only look like some."""
+    other = """def PointInstancer "a" {
+        point3f[] positions = [(70, 0, 0)]
+        float3[] scales = [(7, 7, 7)]
+    }
+    # float[] opacities = [0.5]
+    """
+    text = text.replace("(\n", '(\n    doc = "metersPerUnit = 100, # \\"upAxis = 1"\n    # upAxis = "Z"\n', 1)
+    return (
+        text.replace("def ", f"{other}def ", 1)
+        + 'over "b" {\n float[] opacities = [0.25]\n}\n'
+        + other.replace('"a"', '"c"')
+    )
+
+
+@pytest.mark.parametrize("change", [_squeezed, _half, _sampled, _beside_others])
 def test_the_same_splats_in_other_words(
     tmp_path: Path, change: Callable[[str], str], caplog: pytest.LogCaptureFixture
 ) -> None:
