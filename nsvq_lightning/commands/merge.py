@@ -42,13 +42,15 @@ def run(options: argparse.Namespace) -> int:
         untrained = f"{len(missing)} of {len(files)} parts are not trained yet"
         raise ValueError(f"{untrained}, first {missing[0]}: run their fits")
     blocks = [Block.read(folder) for folder in folders]
+    if len(blocks) < blocks[0].parts:
+        raise ValueError(f"{options.parts} has {len(blocks)} of {blocks[0].parts} parts: copy the others there, too")
     parts = []
     for folder, block, file in zip(folders, blocks, files, strict=True):
         whole = read_scene(file)
         part = whole.take(block.contains(whole.means + whole.origin)).in_use()
         say(f"{folder}: {len(part):,} of {len(whole):,} splats are in its core")
         parts.append(part)
-    photos = load_scene(blocks[0].scene)
+    photos = load_scene(blocks[0].scene, **blocks[0].options)
     # Parts have the coordinates of the whole's files, whose origin only the whole knows.
     scene = replace(CompressedScene.joined(parts), origin=photos.frame.origin)
     size = save(scene, options.output)

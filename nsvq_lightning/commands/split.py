@@ -1,7 +1,8 @@
 r"""Cut a scene folder into parts that are trained one by one, on as many machines as there are, and then merged.
 
 Each part is a scene folder of its own, with the photos and points that show it. The commands that train the parts go to
-standard output, a line each; options of 'nsvq fit' may follow and are in them.
+standard output, a line each; options of 'nsvq fit' may follow and are in them. Those of the data (--data.factor=2) say
+how the photos of the whole are read.
 
 Examples:
   nsvq split photos parts --blocks 4
@@ -14,12 +15,17 @@ import shlex
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import positive
+from nsvq_lightning.commands.sweep import resolve
 
 # Folder of a part's run.
 RUN = "run"
+# Options of the data that hold for the whole, and then those of its parts, whatever the others say.
+READ = "factor", "max_width", "test_every", "images_folder", "model", "masks", "allow_outside"
+AS_WRITTEN = "--data.factor=1", "--data.images_folder=images", "--data.model=null", "--data.masks=masks"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,14 +45,20 @@ def run(options: argparse.Namespace) -> int:
         ValueError: The scene cannot be used or has too little to see for so many parts.
         OSError: The output exists, or a file cannot be read or written.
     """
+    import yaml
+
     from nsvq_lightning.data.blocks import cut, write_blocks
     from nsvq_lightning.data.scene import load_scene
 
     if options.output.exists():
         raise FileExistsError(f"{options.output} exists: remove it, or give another folder")
-    scene = load_scene(options.scene, cache_bytes=0)
+    read: dict[str, Any] = {}
+    if options.further:
+        given = yaml.safe_load(resolve([*options.further, f"--data.root={options.scene}"]))["data"]["init_args"]
+        read = {name: given[name] for name in READ if name in given}
+    scene = load_scene(options.scene, cache_bytes=0, **read)
     behind = ["--model.background=white"] if scene.white else []  # what the photos of parts are in front of
-    blocks = cut(scene, options.blocks)
+    blocks = cut(scene, options.blocks, **read)
     folders = [options.output / str(number) for number in range(1, len(blocks) + 1)]
     for folder in folders:
         folder.mkdir(parents=True)
@@ -58,6 +70,6 @@ def run(options: argparse.Namespace) -> int:
     for folder, (train, test) in zip(folders, counts, strict=True):
         sys.stderr.write(f"{folder}: {train} train and {test} test photos\n")
         root = folder.resolve()
-        fit = ["nsvq", "fit", f"--data.root={root}", f"--trainer.run_folder={root / RUN}", *behind, *options.further]
-        say(shlex.join(fit))
+        ends = [f"--data.root={root}", f"--trainer.run_folder={root / RUN}", *AS_WRITTEN * bool(read)]
+        say(shlex.join(["nsvq", "fit", *behind, *options.further, *ends]))
     return 0

@@ -8,7 +8,7 @@ and masks leave out what is in front of it or behind: no splat is spent on that,
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +44,16 @@ class Block:
         core: Where it begins and ends on both ``[2][2]``.
         around: The same with the surroundings that are trained with it.
         scene: Folder of the whole scene.
+        parts: How many there are; 0 where an earlier version did not say.
+        options: Of :func:`nsvq_lightning.data.scene.load_scene`, how the whole was read.
     """
 
     axes: Sequence[Sequence[float]]
     core: Sequence[Sequence[float]]
     around: Sequence[Sequence[float]]
     scene: str
+    parts: int = 0
+    options: Json = field(default_factory=dict)
 
     def contains(self, points: NDArray[np.floating[Any]], around: bool = False) -> Bools:
         """Which points ``[N, 3]`` are in its core, or in that with its surroundings.
@@ -112,8 +116,13 @@ SLACK = 0.1
 _FAR = 1e30
 
 
-def cut(scene: Scene, count: int) -> list[Block]:
+def cut(scene: Scene, count: int, **options: Any) -> list[Block]:
     """Parts of a scene, of which photos show about the same amount.
+
+    Args:
+        scene: The whole.
+        count: How many.
+        options: How it was read, see :class:`Block`.
 
     Raises:
         SceneError: Photos show too few points for so many parts.
@@ -132,7 +141,7 @@ def cut(scene: Scene, count: int) -> list[Block]:
         if np.count_nonzero(weights) < 4 * number:
             raise SceneError(f"the photos show too few points of {scene.root} for {count} parts: ask for fewer")
         if number == 1:
-            return [Block(axes.tolist(), core.tolist(), around.tolist(), str(scene.root.resolve()))]
+            return [Block(axes.tolist(), core.tolist(), around.tolist(), str(scene.root.resolve()), count, options)]
         spread = [np.subtract(*_quantiles(column, weights, (0.95, 0.05))) for column in places.T]
         axis = np.argmax(spread)
         along = places[:, axis]

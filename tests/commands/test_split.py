@@ -44,6 +44,42 @@ def test_parts_are_trained_by_fit_and_merged(
     assert "exists: remove it, or give another folder" in capsys.readouterr().err
 
 
+def test_options_of_the_data_hold_for_the_whole(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Photos are halved once, of another folder, one in four to test on; so are those that the merged scene meets."""
+    shutil.copytree(demo_scene, tmp_path / "scene")
+    (tmp_path / "scene" / "images").rename(tmp_path / "scene" / "photos")
+    parts = tmp_path / "parts"
+    given = ["--data.factor=2", "--data.images_folder=photos", "--data.test_every=4", "--data.masks=null"]
+    assert main(["split", str(tmp_path / "scene"), str(parts), "--blocks", "2", *given]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    whole = load_scene(tmp_path / "scene", 2, test_every=4, images_folder="photos")
+    for line, folder in zip(lines, (parts / "1", parts / "2"), strict=True):
+        words = [word.removeprefix("--").partition("=") for word in shlex.split(line)[2:]]
+        data = {name: value for name, _, value in words}  # the last one counts
+        assert (data["data.factor"], data["data.images_folder"], data["data.masks"]) == ("1", "images", "masks")
+        part = load_scene(folder, 1)
+        assert sum(image.mask is not None for image in part.images.sources) == len(part)
+        assert len(part.test) <= len(whole.test) == 3
+        assert max(camera.width for camera in part.cameras) <= whole.cameras[0].width
+    splats = Splats.from_points(whole.points, whole.colors, 0)
+    for number in "12":
+        (parts / number / "run").mkdir()
+        save(splats, parts / number / "run" / "scene.nsvq")
+    assert main(["merge", str(parts), "-o", str(tmp_path / "x.ply")]) == 0
+    shutil.rmtree(parts / "2")
+    assert main(["merge", str(parts), "-o", str(tmp_path / "y.ply")]) == 1
+    assert "has 1 of 2 parts: copy the others there, too" in capsys.readouterr().err
+    assert not (tmp_path / "y.ply").exists()
+
+
+def test_options_that_fit_does_not_have_are_refused_at_once(demo_scene: Path, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit):
+        main(["split", str(demo_scene), str(tmp_path / "parts"), "--data.factr=2"])
+    assert not (tmp_path / "parts").exists()
+
+
 def test_the_whole_is_what_lies_in_the_cores(demo_scene: Path, tmp_path: Path) -> None:
     """Each part holds all points; the merged scene has each once."""
     assert main(["split", str(demo_scene), str(tmp_path / "parts"), "--blocks", "3"]) == 0
