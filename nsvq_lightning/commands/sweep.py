@@ -128,7 +128,7 @@ def plan(options: argparse.Namespace) -> list[Run]:
     Raises:
         SystemExit: A configuration or an option of ``nsvq fit`` is wrong; a line on stderr says how.
         ValueError: A codebook size is unknown, a scene is no folder, two runs have the same names, or options give a
-            checkpoint to go on from, or two sizes of the scene.
+            checkpoint to go on from, a seed of everything, or two sizes of the scene.
     """
     import yaml
 
@@ -144,10 +144,11 @@ def plan(options: argparse.Namespace) -> list[Run]:
     for config in options.configs:
         arguments = [*_given({"config": config}), *common]
         default = yaml.safe_load(resolve([*arguments, *_given({"data.root": options.scenes[0]})]))
-        own = {"ckpt_path": default["ckpt_path"], "trainer.run_folder": default["trainer"]["run_folder"]}
+        own = {name: default[name] or None for name in ("ckpt_path", "seed_everything")}
+        own["trainer.run_folder"] = default["trainer"]["run_folder"]
         for option, given in own.items():
             if given is not None:
-                raise ValueError(f"a sweep has checkpoints and folders of its own; leave {option}={given} out")
+                raise ValueError(f"a sweep has checkpoints, folders and --seeds of its own; leave {option}={given} out")
         quantizers, sizes = options.quantizers, options.codebooks
         if default["model"]["codebooks"] is None:
             quantizers = sizes = ("",)
