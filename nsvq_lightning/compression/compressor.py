@@ -474,8 +474,10 @@ def compress(
 
     Raises:
         ValueError: The splats are empty or not finite, cameras do not show them, photos do not fit the cameras, or a
-            limit cannot be met; another background.
+            limit cannot be met, or there are two; another background.
     """
+    if None not in (target_bytes, max_error):
+        raise ValueError("give target_bytes or max_error, not both")
     scene = CompressedScene.from_splats(splats, antialiased=antialiased).finite()
     if background == "white":
         scene = on_white(scene)
@@ -484,6 +486,7 @@ def compress(
     if cameras:
         viewpoints.check_cameras(cameras, scene.means)
         scene = replace(scene, cameras=trained_by(cameras))
+    photos = [torch.as_tensor(photo) for photo in photos]
     views = viewpoints.own_scene(scene.tensors(), cameras, photos=photos) if photos else None
     compressor = Compressor(scene, cameras, views, **settings)
     left = len(scene) if left is None else min(left, len(scene))

@@ -222,6 +222,13 @@ def test_a_scene_of_another_program_is_compressed() -> None:
     assert len(taught) == 200
     with pytest.raises(ValueError, match=r"expected a photo \[H, W, 3\] of its size for each of 8 cameras"):
         nl.compress(splats, cameras, photos[:7])
+    with pytest.raises(ValueError, match="give target_bytes or max_error, not both"):
+        nl.compress(splats, target_bytes=9999, max_error=0.01)
+    arrays = nl.compress(splats, cameras, np.stack([photo.numpy() for photo in photos]) / 255, left=200, steps=8)
+    assert (
+        arrays.means.tobytes()
+        == nl.compress(splats, cameras, [p / 255 for p in photos], left=200, steps=8).means.tobytes()
+    )
     with pytest.raises(ValueError, match="cameras show 0% of the scene's splats"):
         nl.compress(splats, [replace_position(camera) for camera in cameras])
 
