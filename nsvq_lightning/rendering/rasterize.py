@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nsvq_lightning.compute.devices import resolve_backend
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.sampling import Sampling, ViewSampling, focal_of
+from nsvq_lightning.rendering.sampling import Sampling, Shading, ViewSampling, focal_of
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, check_shapes, sh_degree_of
 
@@ -99,9 +99,8 @@ def render(
         view_sampling = ViewSampling(means.new_zeros(2, len(means)), 0.0)
     elif sampling is not None:
         view_sampling = _sampling(means, camera, sampling)
-    image, alpha, radii, means2d, depth = _module_of(backend, means).render(
-        splats, camera, int(degree), behind, pixel_weights, absgrad, view_sampling
-    )
+    shading = Shading(int(degree), view_sampling, behind, pixel_weights, absgrad)
+    image, alpha, radii, means2d, depth = _module_of(backend, means).render(splats, camera, shading)
     return Render(image, alpha, radii, means2d, depth, absgrad)
 
 

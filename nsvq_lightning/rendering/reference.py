@@ -11,7 +11,7 @@ from torch.utils.checkpoint import checkpoint
 
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.sampling import ViewSampling
+from nsvq_lightning.rendering.sampling import Shading, ViewSampling
 from nsvq_lightning.rendering.sh import sh_colors
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors
@@ -131,19 +131,12 @@ def visible(splats: SplatTensors, camera: Camera, sampling: ViewSampling | None 
     return ((depths > camera.near) & reached & torch.isfinite(conics).all(-1)).nonzero()[:, 0]
 
 
-def render(
-    splats: RawSplats,
-    camera: Camera,
-    sh_degree: int,
-    background: Tensor,
-    pixel_weights: Tensor | None,
-    absgrad: Tensor | None,
-    sampling: ViewSampling | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def render(splats: RawSplats, camera: Camera, shading: Shading) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``, differentiable.
 
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.
     """
+    sh_degree, sampling, background, pixel_weights, absgrad = shading
     rows = visible(splats, camera, sampling)
     shown = splats.take(rows)
     projection = project(shown, camera, None if sampling is None else sampling.of(rows))

@@ -46,6 +46,24 @@ class ViewSampling(NamedTuple):
         return ViewSampling(self.distances[:, rows], self.size)
 
 
+class Shading(NamedTuple):
+    """What a back-end is asked for besides splats and camera, see :func:`nsvq_lightning.render`.
+
+    Attributes:
+        sh_degree: Highest degree of the spherical harmonics that is evaluated.
+        sampling: How the splats were trained, if their blur is to keep its size.
+        background: RGB ``[3]``.
+        pixel_weights: Weight of each pixel ``[H, W]``, if wanted.
+        absgrad: Zeros ``[N, 3]`` whose gradient is then set.
+    """
+
+    sh_degree: int
+    sampling: ViewSampling | None
+    background: "Tensor"
+    pixel_weights: "Tensor | None"
+    absgrad: "Tensor | None"
+
+
 class Sampling(NamedTuple):
     """How training saw N splats.
 

@@ -74,9 +74,7 @@ def viewer_page(scene_file: StrPath, cameras: Mapping[str, Camera], title: str, 
     """
     if not cameras:
         raise ValueError("a page needs at least one camera to start from, got none")
-    about = ""
-    start = 0
-    behind = 0.0, 0.0, 0.0
+    about, start, behind = "", 0, (0.0, 0.0, 0.0)
     if live is None or Path(scene_file).is_file():
         stored = read_nsvq(scene_file)
         behind = stored.background

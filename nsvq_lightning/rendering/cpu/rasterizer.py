@@ -16,7 +16,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import binning, projection, projection_backward
 from nsvq_lightning.rendering.cpu import blend as blending
 from nsvq_lightning.rendering.cpu import records as rec
-from nsvq_lightning.rendering.sampling import ViewSampling
+from nsvq_lightning.rendering.sampling import Shading, ViewSampling
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
 from nsvq_lightning.splats.splats import RawSplats, sh_degree_of
@@ -198,15 +198,7 @@ class _Blend(torch.autograd.Function):
         return None, g_means2d, torch.zeros(()), g_background, None, g_absgrad if with_absgrad else None
 
 
-def render(
-    splats: RawSplats,
-    camera: Camera,
-    sh_degree: int,
-    background: Tensor,
-    pixel_weights: Tensor | None,
-    absgrad: Tensor | None,
-    sampling: ViewSampling | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def render(splats: RawSplats, camera: Camera, shading: Shading) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.
@@ -215,9 +207,10 @@ def render(
         ValueError: The attributes do not fit together, or the image is too large.
         TypeError: An attribute is not float32.
     """
+    sh_degree, sampling, *behind = shading
     frame = _Frame(splats, camera, sh_degree, sampling)
     means2d, token, radii = _Project.apply(frame, *splats)
-    image, alpha, depth = _Blend.apply(frame, means2d, token, background, pixel_weights, absgrad)
+    image, alpha, depth = _Blend.apply(frame, means2d, token, *behind)
     return image, alpha, radii, means2d, depth
 
 

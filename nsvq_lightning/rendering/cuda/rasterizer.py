@@ -10,7 +10,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.binning import Tiles, list_tiles
 from nsvq_lightning.rendering.cuda.blend import blend, blend_backward, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens, project, project_backward, project_radii
-from nsvq_lightning.rendering.sampling import ViewSampling
+from nsvq_lightning.rendering.sampling import Shading, ViewSampling
 from nsvq_lightning.splats.splats import RawSplats
 
 
@@ -66,23 +66,16 @@ class _Blend(torch.autograd.Function):
         return None, g_means2d, None, moments, None, g_background, None, g_absgrad
 
 
-def render(
-    splats: RawSplats,
-    camera: Camera,
-    sh_degree: int,
-    background: Tensor,
-    pixel_weights: Tensor | None,
-    absgrad: Tensor | None,
-    sampling: ViewSampling | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def render(splats: RawSplats, camera: Camera, shading: Shading) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.
     """
+    sh_degree, sampling, *behind = shading
     with torch.cuda.device_of(splats.means):
         lens = Lens.of(camera, splats.means.device)
         means2d, radii, ids, records, boxes = _Project.apply(lens, sh_degree, sampling, *splats)
-        image, alpha, depth = _Blend.apply(lens, means2d, ids, records, boxes, background, pixel_weights, absgrad)
+        image, alpha, depth = _Blend.apply(lens, means2d, ids, records, boxes, *behind)
     return image, alpha, radii, means2d, depth
 
 
