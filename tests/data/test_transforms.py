@@ -177,7 +177,7 @@ def test_a_colmap_model_comes_first_and_any_can_be_chosen(make_scene: SceneFacto
     shutil.copytree(make_scene("six", views=6) / "sparse/0", root / "sparse/1")
     counts = {model: len(load_scene(root, model=model)) for model in (None, "1", "sparse/0", "transforms.json")}
     assert counts == {None: 5, "1": 6, "sparse/0": 5, "transforms.json": 9}
-    assert len(ColmapDataModule(str(root), model="1").scene) == 6
+    assert len(ColmapDataModule(str(root), model=1).scene) == 6  # type: ignore[arg-type]
     with pytest.raises(
         SceneError, match=r"no COLMAP model in .*sparse/7: .*\(--data\.model\); there is sparse/0, sparse/1"
     ):
