@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 if not (ROOT / "docs").is_dir():
     pytest.skip("a source distribution has no docs", allow_module_level=True)
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-SMALL = ((r"max_steps=\d+", "max_steps=8"), (r'codebooks="4k"', 'codebooks="0.5k"'))
+SMALL = ((r"max_steps=\d+", "max_steps=8"), (r'codebooks="4k"', 'codebooks="0.5k", steps=8'))
 """What is smaller in a test."""
 EXECUTED = ("info", "convert")
 """Commands that are quick enough to be run, not only parsed."""
