@@ -3,7 +3,9 @@
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 from lightning.pytorch import Callback, Trainer
+from torch.utils._pytree import tree_map_only
 
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.report.pictures import file_stem
@@ -71,7 +73,8 @@ class SplatCallback(Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """What :attr:`state` names, and the last iterations acted on."""
-        return {name: getattr(self, name) for name in ("_acted", *self.state)}
+        state = {name: getattr(self, name) for name in ("_acted", *self.state)}
+        return tree_map_only(np.generic, lambda number: number.item(), state)  # type: ignore[no-any-return]
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from there: what was done before the checkpoint is not repeated."""

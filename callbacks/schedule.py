@@ -136,13 +136,13 @@ class PhaseSchedule(SplatCallback):
             if steps != trainer.max_steps:
                 self._set_max_steps(trainer, steps)
                 log.info(f"iterations: {steps} for {photos} photos; --callbacks.phases.iterations_per_photo changes it")
-        self._steps = trainer.max_steps
         total = self.total if self.total is not None else trainer.max_steps
         if total < 1:
             raise ValueError(
                 f"the run has no length: trainer.max_steps is {trainer.max_steps}; set trainer.max_steps (45000 in the "
                 "paper) or PhaseSchedule.total"
             )
+        self._steps = trainer.max_steps if trainer.max_steps >= 0 else total
         module.schedule = self.schedule(total)
         if 0 < trainer.max_steps < total:
             log.warning(
@@ -180,8 +180,7 @@ class PhaseSchedule(SplatCallback):
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Write the phase of the iteration that starts; end the run earlier by what its warm-up has saved."""
-        if self._steps > 0:
-            self._set_max_steps(trainer, self._steps - module.schedule.saved)
+        self._set_max_steps(trainer, self._steps - module.schedule.saved)
         module.phase = module.schedule.phase_at(trainer.global_step + 1)
         super().on_train_batch_start(trainer, module, batch, batch_idx)
 

@@ -5,12 +5,13 @@ import logging
 import math
 import re
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from nsvq_lightning.commands import nearest
-from nsvq_lightning.commands.settings import settings_of, values_by_name
+from nsvq_lightning.commands.settings import check_config
 
 if TYPE_CHECKING:
     from nsvq_lightning.data.scene import Scene
@@ -140,11 +141,16 @@ def folders_beside(path: Path) -> list[Path]:
     return [run, *run.parents][:3]
 
 
+# Options of the data that say what is read of a scene folder.
+READ = "factor", "max_width", "test_every", "images_folder", "model", "masks", "allow_outside"
+
+
 def _found_views(path: Path, root: Path | None) -> "Views":
     """Cameras by name of the photos that a scene was trained on, and these photos, if a folder of them is named.
 
-    That is ``root``, or the one in the settings of the scene's run; photos of a run have the size that it has trained
-    with. Cameras that are found are those that a run has recorded, or those in the scene's folder or up to two above.
+    That is ``root``, or the one in the settings of the scene's run; photos of a run are those that it has trained on,
+    in their size. Cameras that are found are those that a run has recorded, or those in the scene's folder or up to two
+    above.
     """
     from nsvq_lightning.data.colmap import NoPhotosError
     from nsvq_lightning.data.scene import load_cameras, load_scene
@@ -153,20 +159,21 @@ def _found_views(path: Path, root: Path | None) -> "Views":
     from nsvq_lightning.report.viewer import page_cameras
 
     run = _run_of(path).resolve()
-    settings = {} if root else values_by_name(settings_of([str(_run_of(path) / "config.yaml")]))
+    data: dict[str, Any] = {}
+    with suppress(KeyError, TypeError):  # a config of something else
+        data = {} if root else {**check_config(str(_run_of(path) / "config.yaml"))["data"]["init_args"]}
     folder = root
-    if given := settings.get("data.root"):
+    if given := data.get("root"):
         folder = Path(given).expanduser()
         if not folder.is_dir():
             folder = None
     if folder is not None and (has_poses(folder) or not (folder / CAMERAS).is_file()):
-        texts = settings.get("data.factor", ""), settings.get("data.max_width", "1600")
-        size = [int(text) if text.isdigit() else None for text in texts]
+        how = {name: data[name] for name in READ if name in data}
         try:
-            scene = load_scene(folder, *size)  # type: ignore[arg-type]
+            scene = load_scene(folder, **how)
         except NoPhotosError:
             log.info("%s has cameras, but no photos", folder)
-            return load_cameras(folder, *size), None  # type: ignore[arg-type]
+            return load_cameras(folder, **how), None
         return dict(zip(scene.names, scene.cameras, strict=True)), scene
     if folder is None and (run / "viewer.html").is_file():
         return page_cameras(run / "viewer.html"), None

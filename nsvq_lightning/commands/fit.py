@@ -73,9 +73,8 @@ class RunStart(SaveConfigCallback):
                 self.config["trainer.max_steps"] = trainer.max_steps
                 phases.minutes = phases.iterations_per_photo = None
             for option in ("data.init_args.root", "model.init_from"):
-                given = self.config.get(option)
-                if isinstance(given, str):  # so that it is found from any folder
-                    self.config[option] = os.path.abspath(given)
+                if isinstance(given := self.config.get(option), str):  # so that it is found from any folder
+                    self.config[option] = os.path.abspath(os.path.expanduser(given))
             self._write(folder)
 
     def on_train_end(self, trainer: Trainer, pl_module: SplatModule) -> None:  # type: ignore[override]

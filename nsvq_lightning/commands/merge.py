@@ -37,8 +37,7 @@ def run(options: argparse.Namespace) -> int:
     if not folders:
         raise ValueError(f"{options.parts} has no parts: make them with 'nsvq split'")
     files = [folder / RUN / "scene.nsvq" for folder in folders]
-    missing = [file for file in files if not file.is_file()]
-    if missing:
+    if missing := [file for file in files if not file.is_file()]:
         untrained = f"{len(missing)} of {len(files)} parts are not trained yet"
         raise ValueError(f"{untrained}, first {missing[0]}: run their fits")
     blocks = [Block.read(folder) for folder in folders]

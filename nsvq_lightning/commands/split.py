@@ -18,13 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from nsvq_lightning.commands import say
-from nsvq_lightning.commands.arguments import positive
+from nsvq_lightning.commands.arguments import READ, positive
 from nsvq_lightning.commands.sweep import resolve
 
 # Folder of a part's run.
 RUN = "run"
-# Options of the data that hold for the whole, and then those of its parts, whatever the others say.
-READ = "factor", "max_width", "test_every", "images_folder", "model", "masks", "allow_outside"
+# Options of the data of parts, whatever those of the whole are.
 AS_WRITTEN = "--data.factor=1", "--data.images_folder=images", "--data.model=null", "--data.masks=masks"
 
 

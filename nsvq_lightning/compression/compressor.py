@@ -486,8 +486,8 @@ def compress(
     if cameras:
         viewpoints.check_cameras(cameras, scene.means)
         scene = replace(scene, cameras=trained_by(cameras))
-    photos = [torch.as_tensor(photo) for photo in photos]
-    views = viewpoints.own_scene(scene.tensors(), cameras, photos=photos) if photos else None
+    shown = [torch.as_tensor(photo) for photo in photos]
+    views = viewpoints.own_scene(scene.tensors(), cameras, photos=shown) if shown else None
     compressor = Compressor(scene, cameras, views, **settings)
     left = len(scene) if left is None else min(left, len(scene))
     return compressor.best(left, codebooks, target_bytes, max_error).scene

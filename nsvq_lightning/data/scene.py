@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import cv2
 import numpy as np
@@ -302,14 +302,22 @@ def _scaled(lens: Pinhole, divisor: int, max_width: int | None) -> Pinhole:
     return lens.scaled(scale, scale)
 
 
-def load_cameras(root: str | Path, factor: Factor | None = None, max_width: int | None = 1600) -> dict[str, Camera]:
+def load_cameras(
+    root: str | Path,
+    factor: Factor | None = None,
+    max_width: int | None = 1600,
+    model: str | None = None,
+    **others: Any,
+) -> dict[str, Camera]:
     """Cameras of a scene folder by the names of its photos, which need not be there; those of :func:`load_scene`.
+
+    Options are those of that function, too; the others make no difference.
 
     Raises:
         SceneError: There is no model, or it is damaged; or it does not say how large the photos are.
     """
     root = Path(root)
-    poses, frame = _framed(read_poses(root, allow_outside=True), root)
+    poses, frame = _framed(read_poses(root, model, allow_outside=True), root)
     lenses = {}
     for number, lens in poses.cameras.items():
         full, _ = rectify(lens, lens.width, lens.height, keep_maps=False)

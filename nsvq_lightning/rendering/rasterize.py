@@ -124,9 +124,8 @@ def _sampling(means: Tensor, camera: Camera, sampling: Sampling | Tensor | float
 
 def _checked(splats: SplatTensors) -> RawSplats:
     """The attributes, contiguous; refuses those of another dtype or on another device than the means."""
-    if not all(isinstance(getattr(splats, name, None), Tensor) for name in ATTRIBUTES):
-        ways = "of a dictionary Splats.from_tensors(**it), of a CompressedScene its decode()"
-        raise TypeError(f"splats must be Splats or others with tensors of their names, got {type(splats)}: {ways}")
+    if not isinstance(getattr(splats, "means", None), Tensor):
+        raise TypeError(f"splats must be Splats, as Splats.from_tensors(**them) or scene.decode(), got {type(splats)}")
     tensors = {name: getattr(splats, name).contiguous() for name in ATTRIBUTES}
     check_shapes(tensors)
     kinds = {name: (tensor.dtype, tensor.device) for name, tensor in tensors.items()}

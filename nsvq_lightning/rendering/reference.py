@@ -75,16 +75,14 @@ def image_axes(
     return (x, y, z), (across[:, :, None] * axes).sum(1), (along[:, :, None] * axes).sum(1)
 
 
-def sampling_ratio(means: Tensor, camera: Camera, sampling: ViewSampling | None) -> Tensor:
-    """r² ``[N]``: pixels per unit of world at splats of centres ``[N, 3]``, relative to training, squared.
+def sampling_ratio(squared: Tensor, sampling: ViewSampling | None) -> Tensor:
+    """r² ``[N]``: pixels per unit of world at splats of squared distances ``[N]``, relative to training, squared.
 
     Within the distances of training, that is (focal length here / there)²; 1 where training is not known.
     """
     if sampling is None:
-        return torch.ones_like(means[:, 0])
-    viewmat = camera.viewmat.to(means)
-    squared = (times_vectors(viewmat[:3, :3], means) + viewmat[:3, 3]).square().sum(1)
-    nearest, farthest = sampling.distances.to(means).square()
+        return torch.ones_like(squared)
+    nearest, farthest = sampling.distances.to(squared).square()
     trained = torch.where(squared < nearest, nearest, torch.where(squared > farthest, farthest, squared))
     return sampling.size * (trained / squared).clamp_max(constants.MAX_RATIO)
 
@@ -105,7 +103,7 @@ def project(splats: SplatTensors, camera: Camera, sampling: ViewSampling | None 
     size = (xx + yy).detach()
     unit = torch.where(size > constants.HUGE_FOOTPRINT, 1 / size, torch.ones_like(size))
     area = (torch.linalg.cross(u, v) * unit[:, None]).square().sum(-1)
-    trained = constants.BLUR * sampling_ratio(splats.means, camera, sampling)
+    trained = constants.BLUR * sampling_ratio(x * x + y * y + z * z, sampling)
     blur = trained.clamp_min(constants.BLUR)
     kept, determinant = (area + b * (xx + yy + b) * unit * unit for b in (trained, blur))
     conics = torch.stack([yy + blur, -xy, xx + blur], -1) * (unit / determinant * unit)[:, None]

@@ -431,9 +431,8 @@ class SplatModule(LightningModule):
             self.schedule = Schedule(**checkpoint["schedule"])
             return
         self.schedule = resume.continued_schedule(checkpoint, self.schedule)
-        change = resume.changed_schedule(checkpoint, self.schedule)
-        if change is not None:
-            log.warning(change)
+        if changed := resume.changes(checkpoint, self.schedule, {**self.hparams, "background": self.background}):
+            log.warning("the checkpoint is of a run with other settings: pass %s to continue it as it was", changed)
         resume.check_continuation(checkpoint, self.state_dict(), self.quantizer_settings)
 
 

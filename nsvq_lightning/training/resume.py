@@ -38,18 +38,17 @@ def continued_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> Sch
     return replace(schedule, saved=stored.saved) if same else schedule
 
 
-def changed_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> str | None:
-    """What to report on a run that continues from a checkpoint with this schedule; None if nothing changes."""
-    stored, own = checkpoint["schedule"], asdict(schedule)
-    changed = [name for name, value in stored.items() if value != own[name] and name != "saved"]
-    options = {name: f"--callbacks.phases.{name}" for name in changed} | {"total": "--trainer.max_steps"}
-    if not changed:
-        return None
-    return (
-        f"the checkpoint is of a run with {', '.join(f'{name} = {stored[name]}' for name in changed)}, this one "
-        f"continues with {', '.join(f'{name} = {own[name]}' for name in changed)}; pass "
-        f"{' '.join(f'{options[name]}={stored[name]}' for name in changed)} to continue that run as it was"
-    )
+def changes(checkpoint: Mapping[str, Any], schedule: Schedule, own: Mapping[str, Any]) -> str:
+    """Options by which a run with another schedule and other settings of the module goes on as that of a checkpoint."""
+    trained = checkpoint.get("hyper_parameters", {})
+    kinds = ("callbacks.phases", checkpoint["schedule"], asdict(schedule)), ("model", trained, plain(own))
+    changed = [
+        f"--{kind}.{name}={value}"
+        for kind, stored, here in kinds
+        for name, value in stored.items()
+        if here.get(name, value) != value and name != "saved"
+    ]
+    return " ".join(changed).replace("callbacks.phases.total", "trainer.max_steps")
 
 
 def check_continuation(

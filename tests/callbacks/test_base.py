@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 from lightning.pytorch import Callback, LightningModule
 
 from nsvq_lightning import callbacks
@@ -87,6 +90,14 @@ def test_hooks_run_once_an_iteration_also_with_accumulation_and_after_a_resume()
     play(resumed, 1, first=2)
     assert resumed.noted == [("after", 3)]
     assert resumed.state_dict() == whole.state_dict()
+
+
+def test_numbers_of_numpy_become_plain_data_in_a_checkpoint(tmp_path: Path) -> None:
+    """With them, it could be written and not be read."""
+    callback = Acting()
+    vars(callback).update(count=np.median([1, 2]), _acted={"after": np.int64(7)})
+    torch.save(callback.state_dict(), tmp_path / "state")
+    assert torch.load(tmp_path / "state", weights_only=True) == {"_acted": {"after": 7}, "count": 1.5}
 
 
 def test_a_fit_starts_without_what_an_earlier_one_has_reached() -> None:

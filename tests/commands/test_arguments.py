@@ -140,6 +140,23 @@ def test_photos_of_a_run_have_the_size_that_it_trained(
     assert {camera.width for camera in known_views(tmp_path, None)[0].values()} == {width}
 
 
+def test_cameras_of_a_run_are_of_the_model_that_it_trained(tmp_path: Path, demo_scene: Path) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(demo_scene, scene)
+    (scene / "images").rename(scene / "photos")
+    (scene / "sparse" / "0").rename(scene / "sparse" / "1")
+    shutil.copytree(demo_scene / "sparse" / "0", scene / "sparse" / "0")
+    for name in ("images.bin", "images.txt"):
+        (scene / "sparse" / "0" / name).unlink(missing_ok=True)  # not the model
+    settings = "model: '1', images_folder: photos, masks: null"
+    (tmp_path / "config.yaml").write_text(f"data: {{init_args: {{root: {scene}, {settings}}}}}")
+    cameras, photos = known_views(tmp_path, None)
+    assert photos is not None
+    assert len(cameras) == len(load_scene(demo_scene))
+    shutil.rmtree(scene / "photos")
+    assert known_views(tmp_path, None)[0].keys() == cameras.keys()
+
+
 def test_no_cameras_are_found_where_there_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert known_views(Path("scene.ply"), None)[0] == {}

@@ -277,7 +277,7 @@ def test_what_has_no_tensors_is_refused_with_a_way() -> None:
     splats, camera = random_splats(20), front_camera()
     for other in (splats._asdict(), CompressedScene.from_splats(splats), None):
         for function in (render, visible):
-            with pytest.raises(TypeError, match=r"must be Splats .* got .*: of a dictionary Splats.from_tensors"):
+            with pytest.raises(TypeError, match=r"must be Splats, as Splats.from_tensors.*, got .*class"):
                 function(other, camera)  # type: ignore[arg-type]
 
 

@@ -21,7 +21,7 @@ from nsvq_lightning.quantize import NSVQ, StraightThrough
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import (
     PlainCheckpointIO,
-    changed_schedule,
+    changes,
     check_continuation,
     check_scene,
     check_settings,
@@ -176,11 +176,12 @@ def test_another_schedule_is_told_of() -> None:
     module.schedule = Schedule(min_reset_interval=11, saved=3)
     stored: dict[str, Any] = {"state_dict": module.state_dict()}
     module.on_save_checkpoint(stored)
-    assert changed_schedule(stored, replace(module.schedule, saved=0)) is None
-    assert changed_schedule(stored, Schedule(min_reset_interval=12)) == (
-        "the checkpoint is of a run with min_reset_interval = 11, this one continues with min_reset_interval = 12; "
-        "pass --callbacks.phases.min_reset_interval=11 to continue that run as it was"
-    )
+    assert not changes(stored, replace(module.schedule, saved=0), {})
+    stored["hyper_parameters"] = {"antialiased": True, "sh_degree": 1}
+    others = changes(stored, Schedule(total=7, min_reset_interval=12), {"antialiased": False, "sh_degree": 1})
+    assert others.split() == [
+        "--trainer.max_steps=45000", "--callbacks.phases.min_reset_interval=11", "--model.antialiased=True",
+    ]  # fmt: skip
 
 
 def check(checkpoint: dict[str, Any], module: SplatModule) -> None:

@@ -154,6 +154,11 @@ def test_few_photos_shorten_the_run(run: RunFactory, recipe: Recipe, caplog: pyt
     assert run(recipe(phases=phases).values())[0].global_step == 17
 
 
+def test_the_length_of_the_schedule_is_that_of_a_run_without_any(run: RunFactory, recipe: Recipe) -> None:
+    phases = PhaseSchedule(reference_total=60, total=9, **ENDS)
+    assert run(recipe(phases=phases).values(), max_steps=-1)[0].global_step == 9
+
+
 def test_growth_that_has_nothing_to_split_ends_the_warm_up_and_shortens_the_run(
     run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
 ) -> None:
