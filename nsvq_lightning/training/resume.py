@@ -46,7 +46,7 @@ def changes(checkpoint: Mapping[str, Any], schedule: Schedule, own: Mapping[str,
         f"--{kind}.{name}={value}"
         for kind, stored, here in kinds
         for name, value in stored.items()
-        if here.get(name, value) != value and name != "saved"
+        if here.get(name, value) != value and name not in ("saved", "init_from")
     ]
     return " ".join(changed).replace("callbacks.phases.total", "trainer.max_steps")
 

@@ -177,8 +177,10 @@ def test_another_schedule_is_told_of() -> None:
     stored: dict[str, Any] = {"state_dict": module.state_dict()}
     module.on_save_checkpoint(stored)
     assert not changes(stored, replace(module.schedule, saved=0), {})
-    stored["hyper_parameters"] = {"antialiased": True, "sh_degree": 1}
-    others = changes(stored, Schedule(total=7, min_reset_interval=12), {"antialiased": False, "sh_degree": 1})
+    stored["hyper_parameters"] = {"antialiased": True, "sh_degree": 1, "init_from": "a.ply"}
+    others = changes(
+        stored, Schedule(total=7, min_reset_interval=12), {"antialiased": False, "sh_degree": 1, "init_from": "/a.ply"}
+    )
     assert others.split() == [
         "--trainer.max_steps=45000", "--callbacks.phases.min_reset_interval=11", "--model.antialiased=True",
     ]  # fmt: skip
