@@ -16,6 +16,7 @@ SMALL = (
     (r"DemoDataModule\(\)", "DemoDataModule(factor=4)"),
     (r"--data\.root=\{DEMO\}\"", '--data.root={DEMO}", "--data.factor=4"'),
     (r'^sizes = ".*"', 'sizes = "1k,0.5k"'),
+    (r"str\(small\)\]", 'str(small), "--minutes=0.1"]'),
 )
 """What is smaller in a test."""
 
