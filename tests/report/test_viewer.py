@@ -33,6 +33,7 @@ from nsvq_lightning.splats.splats import RawSplats
 WEB = Path(viewer.__file__).parent / "web"
 NASTY = '</title></script><script>alert(1)</script><img src="//x.y/$file" onerror=alert(2)> & <!--'
 WHITE = {"background": "white"}
+COLOR = (0.2, 0.4, 0.6)
 DAMAGED = "The scene in this page is damaged"
 
 
@@ -180,12 +181,12 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 
 
 @torch.no_grad()
-def _psnr(tab: Page, scene_file: Path, camera: Camera) -> float:
+def _psnr(tab: Page, scene_file: Path, camera: Camera, background: tuple[float, ...] | None = None) -> float:
     """PSNR in dB of what the page draws against this package's own picture, both of 8 bits."""
     picture = base64.b64decode(tab.run("nsvqViewer.picture()").split(",")[1])
     drawn, scene = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")), read_scene(scene_file)
     how = {"antialiased": scene.antialiased, "sampling": scene.sampling()}
-    image = render(scene.decode(), camera, background=scene.background, **how).image
+    image = render(scene.decode(), camera, background=background or scene.background, **how).image
     expected = (image.clamp(0, 1) * 255).round().numpy()
     return float(10 * np.log10(255**2 / np.square(drawn - expected).mean()))
 
@@ -206,12 +207,16 @@ def test_anti_aliasing_is_what_the_file_says(tab: Page, tmp_path: Path) -> None:
     for antialiased in (False, True):
         scene = CompressedScene.from_splats(small, config={"antialiased": antialiased})
         save(scene, tmp_path / f"{antialiased}.nsvq")
-        write_viewer(tmp_path / "viewer.html", tmp_path / f"{antialiased}.nsvq", _cameras(), "t")
+        page = tmp_path / "viewer.html"
+        write_viewer(page, tmp_path / f"{antialiased}.nsvq", _cameras(), "t")
+        text, found = re.subn(r'"background": ?\[0\.0, ?0\.0, ?0\.0\]', f'"background": {[*COLOR]}', page.read_text())
+        assert found == 1
+        page.write_text(text)
         camera = _cameras()["front"]
         _shown(tab, (tmp_path / "viewer.html").as_uri(), camera.width, camera.height)
-        assert _psnr(tab, tmp_path / f"{antialiased}.nsvq", camera) > 52
-        assert _psnr(tab, tmp_path / "False.nsvq", camera) > 52 or antialiased
-    assert _psnr(tab, tmp_path / "False.nsvq", camera) < 40
+        assert _psnr(tab, tmp_path / f"{antialiased}.nsvq", camera, COLOR) > 55
+        assert _psnr(tab, tmp_path / "False.nsvq", camera, COLOR) > 55 or antialiased
+    assert _psnr(tab, tmp_path / "False.nsvq", camera, COLOR) < 40
 
 
 @needs_chromium
