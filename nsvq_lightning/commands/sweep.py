@@ -144,8 +144,9 @@ def plan(options: argparse.Namespace) -> list[Run]:
     for config in options.configs:
         arguments = [*_given({"config": config}), *common]
         default = yaml.safe_load(resolve([*arguments, *_given({"data.root": options.scenes[0]})]))
-        for option in ("ckpt_path", "seed_everything", "run_folder"):
-            if given := {**default, **default["trainer"]}[option]:
+        own = {**default, "trainer.run_folder": default["trainer"]["run_folder"]}
+        for option in ("ckpt_path", "seed_everything", "trainer.run_folder"):
+            if given := own[option]:
                 raise ValueError(f"a sweep has checkpoints, folders and --seeds of its own; leave {option}={given} out")
         quantizers, sizes = options.quantizers, options.codebooks
         if default["model"]["codebooks"] is None:

@@ -196,7 +196,7 @@ def load_scene(
     if test_every < 2:
         raise ValueError(f"test_every must be at least 2 (1 leaves no train view), got {test_every}")
     root = Path(root).expanduser()
-    poses = read_poses(root, model if model is None else str(model), allow_outside=allow_outside)
+    poses = read_poses(root, model, allow_outside=allow_outside)
     if model is None and poses.source == "COLMAP" and (larger := larger_models(root)):
         log.warning("%s: %s", root, larger)
     views = range(len(poses.images))
@@ -303,11 +303,7 @@ def _scaled(lens: Pinhole, divisor: int, max_width: int | None) -> Pinhole:
 
 
 def load_cameras(
-    root: str | Path,
-    factor: Factor | None = None,
-    max_width: int | None = 1600,
-    model: str | None = None,
-    **others: Any,
+    root: str | Path, factor: Factor | None = None, max_width: int | None = 1600, model: str | None = None, **rest: Any
 ) -> dict[str, Camera]:
     """Cameras of a scene folder by the names of its photos, which need not be there; those of :func:`load_scene`.
 

@@ -50,6 +50,7 @@ def read_poses(
     if model is None:
         files = [] if colmap.find_model(root) else _files_in(root)
     else:
+        model = str(model)  # a number in Python
         files = [root / model] if model.endswith(".json") else []
     if files:
         poses = _read_transforms(root, files, allow_outside)

@@ -4,6 +4,7 @@ import argparse
 import json
 import shutil
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from splat_scenes import random_splats
 
 from nsvq_lightning.commands.arguments import (
+    READ,
     Parser,
     integers,
     known_views,
@@ -138,6 +140,10 @@ def test_photos_of_a_run_have_the_size_that_it_trained(
 ) -> None:
     (tmp_path / "config.yaml").write_text(f"data: {{init_args: {{root: {demo_scene}, {settings}}}}}")
     assert {camera.width for camera in known_views(tmp_path, None)[0].values()} == {width}
+
+
+def test_what_is_read_of_a_folder_is_all_that_loading_a_scene_takes() -> None:
+    assert {*READ} == signature(load_scene).parameters.keys() - {"root", "cache_bytes"}
 
 
 def test_cameras_of_a_run_are_of_the_model_that_it_trained(tmp_path: Path, demo_scene: Path) -> None:

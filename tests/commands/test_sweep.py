@@ -116,7 +116,7 @@ def test_what_cannot_be_is_said_at_once(scenes: tuple[str, str], tmp_path: Path)
         planned(fox, "--ckpt_path=a.ckpt")
     with pytest.raises(ValueError, match=r"--seeds of its own; leave seed_everything=3 out"):
         planned("--seeds=0,3", "--seed_everything=3")
-    with pytest.raises(ValueError, match=r"--seeds of its own; leave run_folder=a out"):
+    with pytest.raises(ValueError, match=r"--seeds of its own; leave trainer\.run_folder=a out"):
         planned(fox, "--trainer.run_folder=a")
 
 
