@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import signal
@@ -42,8 +43,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the files first that take longest."""
+    """Put the files first that take longest; of what was imported, which takes 0.3 s each time, collect no garbage."""
     items.sort(key=lambda item: FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST))
+    gc.freeze()
 
 
 class SkipWithoutPycolmap(MetaPathFinder):

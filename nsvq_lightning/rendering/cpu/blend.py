@@ -286,7 +286,7 @@ def blend(
 ):  # fmt: skip
     """Blend a tile; a pixel depends only on its own one.
 
-    ``size`` is width and height, ``planes`` are image, transmittance, depth and alpha. ``cull_blocks`` says
+    ``size`` is width and height, ``planes`` are image, transmittance and depth. ``cull_blocks`` says
     whether to skip the blocks that a splat cannot reach.
     """
     begin, end = np.int64(offsets[tile]), np.int64(offsets[tile + 1])
