@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from nsvq_lightning.data.scene import Scene
     from nsvq_lightning.io.compressed import CompressedScene
     from nsvq_lightning.rendering.camera import Camera
-    from nsvq_lightning.splats.conventions import Float32s
-    from nsvq_lightning.splats.splats import SplatTensors
+    from nsvq_lightning.rendering.frame import Origin
 
     # Cameras by the names of their photos, and these.
     Views = tuple[dict[str, Camera], Scene | None]
@@ -145,12 +144,12 @@ def folders_beside(path: Path) -> list[Path]:
 READ = "factor", "max_width", "test_every", "images_folder", "model", "masks", "allow_outside"
 
 
-def _found_views(path: Path, root: Path | None) -> "Views":
+def _found_views(path: Path, root: Path | None, origin: "Origin") -> "Views":
     """Cameras by name of the photos that a scene was trained on, and these photos, if a folder of them is named.
 
     That is ``root``, or the one in the settings of the scene's run; photos of a run are those that it has trained on,
     in their size. Cameras that are found are those that a run has recorded, or those in the scene's folder or up to two
-    above.
+    above; those of a folder are relative to the scene's origin.
     """
     from nsvq_lightning.data.colmap import NoPhotosError
     from nsvq_lightning.data.scene import load_cameras, load_scene
@@ -168,7 +167,7 @@ def _found_views(path: Path, root: Path | None) -> "Views":
         if not folder.is_dir():
             folder = None
     if folder is not None and (has_poses(folder) or not (folder / CAMERAS).is_file()):
-        how = {name: data[name] for name in READ if name in data}
+        how = {name: data[name] for name in READ if name in data} | {"origin": origin}
         try:
             scene = load_scene(folder, **how)
         except NoPhotosError:
@@ -181,11 +180,11 @@ def _found_views(path: Path, root: Path | None) -> "Views":
         if (place / CAMERAS).is_file():
             return read_cameras(place / CAMERAS), None
         if has_poses(place):
-            return load_cameras(place), None
+            return load_cameras(place, origin=origin), None
     return {}, None
 
 
-def known_views(path: Path, root: Path | None, means: "Float32s | None" = None) -> "Views":
+def known_views(path: Path, root: Path | None, scene: "CompressedScene | None" = None) -> "Views":
     """Cameras by name of the photos that a scene was trained on, or that its run or trainer has left beside it.
 
     They are looked for as ``viewer.html`` in the folder of a run, as ``cameras.json`` of INRIA's trainer, as a COLMAP
@@ -194,7 +193,7 @@ def known_views(path: Path, root: Path | None, means: "Float32s | None" = None) 
     Args:
         path: A scene file, or the folder of a run.
         root: Folder whose cameras they are instead; it needs no photos.
-        means: Positions of the scene ``[N, 3]``: cameras that do not show it are not its own, which is a warning.
+        scene: The scene, if it has been read: cameras that do not show it are not its own, which is a warning.
 
     Returns:
         The cameras, and the photos, if there are any.
@@ -205,11 +204,11 @@ def known_views(path: Path, root: Path | None, means: "Float32s | None" = None) 
     """
     from nsvq_lightning.compression.viewpoints import check_cameras
 
-    cameras, photos = _found_views(path, root)
-    if means is None or not cameras or not len(means):
+    cameras, photos = _found_views(path, root, scene.origin if scene else (0, 0, 0))
+    if not (scene and cameras):
         return cameras, photos
     try:
-        check_cameras(list(cameras.values()), means)
+        check_cameras(list(cameras.values()), scene.means)
     except ValueError as error:
         log.warning("%s: the cameras of %s are not used: %s", path, root or "the folders beside it", error)
         return {}, None
@@ -257,7 +256,7 @@ def scene_with_views(
     cameras: list[Camera] = []
     photos = None
     try:
-        known, photos = known_views(path, root, scene.means)
+        known, photos = known_views(path, root, scene)
         cameras = list(known.values())
     except (ValueError, OSError) as error:
         if root is not None:
@@ -271,12 +270,12 @@ def scene_with_views(
     return scene, cameras, photos
 
 
-def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -> "list[Camera]":
+def views_of(path: Path, scene: "CompressedScene", most: int, root: Path | None) -> "list[Camera]":
     """At most ``most`` views of a scene file in which its pictures count; those to train on, where photos are known.
 
     Args:
         path: The file.
-        splats: Raw attributes of N > 0 splats; where no cameras are known, views are those from where they show detail.
+        scene: N > 0 splats; where no cameras are known, views are those from where they show detail.
         most: Number of views.
         root: Folder of the cameras, with their photos or without.
 
@@ -286,6 +285,6 @@ def views_of(path: Path, splats: "SplatTensors", most: int, root: Path | None) -
     from nsvq_lightning.compression.viewpoints import square_views
     from nsvq_lightning.data.scene import spread
 
-    cameras, photos = known_views(path, root, splats.means.detach().numpy())
+    cameras, photos = known_views(path, root, scene)
     known = list(cameras.values()) if photos is None else photos.train_cameras
-    return spread(known, most) or square_views(splats, most)
+    return spread(known, most) or square_views(scene.tensors(), most)

@@ -171,7 +171,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     from nsvq_lightning.report.numbers import evaluate
     from nsvq_lightning.training.importance import floaters
 
-    photos = load_scene(root)
+    photos = load_scene(root, origin=scene.origin)
     splats = scene.tensors()
     look = renderer(on_white(scene) if photos.white else scene)
 
@@ -192,9 +192,8 @@ def _thinned(scene: CompressedScene, count: int, options: argparse.Namespace) ->
     from nsvq_lightning.random import top_rows
     from nsvq_lightning.training.importance import contributions, row_weights
 
-    splats = scene.tensors()
-    cameras = views_of(options.inputs[0], splats, VIEWS, options.root)
-    found = contributions(splats, cameras, renderer(scene))
+    cameras = views_of(options.inputs[0], scene, VIEWS, options.root)
+    found = contributions(scene.tensors(), cameras, renderer(scene))
     return scene.take(top_rows(row_weights(found), count).numpy())
 
 
@@ -203,7 +202,6 @@ def _measure(source: Path, output: Path, root: Path | None) -> None:
     from nsvq_lightning.compression.viewpoints import MEASURED, Measure
 
     original = formats.read_scene(source)
-    splats = original.tensors()
-    measure = Measure(splats, views_of(source, splats, MEASURED, root), renderer(original))
+    measure = Measure(original.tensors(), views_of(source, original, MEASURED, root), renderer(original))
     error = measure.error(formats.read_scene(output).tensors())
     say(f"  {written_error(measure, error, source.name)}")

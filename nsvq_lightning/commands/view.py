@@ -114,7 +114,7 @@ def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     # What a run has recorded are its own, and need no look at the scene.
     is_own = options.root is None and (options.scene / "viewer.html").is_file()
     scene = None if options.live or is_own else read_scene(file)
-    cameras, _ = known_views(options.scene, options.root, None if scene is None else scene.means)
+    cameras, _ = known_views(options.scene, options.root, scene)
     if cameras:
         return dict(spread(list(cameras.items()), MAX_CAMERAS))
     if options.live:

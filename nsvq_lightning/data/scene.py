@@ -24,7 +24,7 @@ from nsvq_lightning.data.points import random_points
 from nsvq_lightning.data.transforms import read_poses
 from nsvq_lightning.data.undistortion import rectify
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
+from nsvq_lightning.rendering.frame import EXTENT, ZERO, Frame, Origin, middle_of
 from nsvq_lightning.splats.conventions import Bools, Float64s
 
 log = logging.getLogger(__name__)
@@ -156,6 +156,7 @@ def load_scene(
     model: str | None = None,
     masks: str | None = "masks",
     allow_outside: bool = False,
+    origin: Origin = ZERO,
 ) -> Scene:
     """Load a scene: photos, and the cameras of a COLMAP model (binary or text) or of a transforms file.
 
@@ -182,6 +183,8 @@ def load_scene(
         model: Which model, see :func:`nsvq_lightning.data.transforms.read_poses`; None looks for one.
         masks: Name of the folder of masks, which need not exist; None ignores masks.
         allow_outside: Also read photos and masks that the model names outside the scene folder.
+        origin: What positions are to be relative to, as those of splats are; where it is 0, that is the middle of the
+            cameras if they are far away.
 
     Raises:
         NoPhotosError: All photos are missing; :func:`load_cameras` needs none.
@@ -228,7 +231,7 @@ def load_scene(
         mask_folders = [f"{masks}_{factor}", masks] if factor else [masks]
         mask_files = find_masks(poses.images, files, folder, root, mask_folders)
     sources = _image_sources(poses, files, mask_files, divisor, max_width if factor is None else None)
-    poses, frame = _framed(poses, root)
+    poses, frame = _framed(poses, root, origin)
     pairs = zip(poses.images, sources, strict=True)
     cameras = tuple(_camera(image, source.pinhole, frame) for image, source in pairs)
     if not len(poses.points):
@@ -303,7 +306,12 @@ def _scaled(lens: Pinhole, divisor: int, max_width: int | None) -> Pinhole:
 
 
 def load_cameras(
-    root: str | Path, factor: Factor | None = None, max_width: int | None = 1600, model: str | None = None, **rest: Any
+    root: str | Path,
+    factor: Factor | None = None,
+    max_width: int | None = 1600,
+    model: str | None = None,
+    origin: Origin = ZERO,
+    **rest: Any,
 ) -> dict[str, Camera]:
     """Cameras of a scene folder by the names of its photos, which need not be there; those of :func:`load_scene`.
 
@@ -313,7 +321,7 @@ def load_cameras(
         SceneError: There is no model, or it is damaged; or it does not say how large the photos are.
     """
     root = Path(root)
-    poses, frame = _framed(read_poses(root, model, allow_outside=True), root)
+    poses, frame = _framed(read_poses(root, model, allow_outside=True), root, origin)
     lenses = {}
     for number, lens in poses.cameras.items():
         full, _ = rectify(lens, lens.width, lens.height, keep_maps=False)
@@ -364,7 +372,7 @@ def usable(scene: Scene) -> Scene:
     return replace(scene, train=train, test=test)
 
 
-def _framed(model: ColmapModel, root: Path) -> tuple[ColmapModel, Frame]:
+def _framed(model: ColmapModel, root: Path, origin: Origin) -> tuple[ColmapModel, Frame]:
     """The frame of a model's cameras, and the model with an origin near them; warns of cameras that went astray."""
     centres = np.stack([image.centre for image in model.images])
     frame = Frame.around(centres)
@@ -373,13 +381,15 @@ def _framed(model: ColmapModel, root: Path) -> tuple[ColmapModel, Frame]:
         first = model.images[lost[0]].name
         log.warning("%d photos are far from all others, first %s: check its pose, or leave it out", len(lost), first)
     distance = np.linalg.norm(frame.middle) / (EXTENT * frame.unit)
-    if distance < _FARTHEST:
+    if not any(origin) and distance >= _FARTHEST:
+        origin = frame.middle
+        log.info("%s: positions are relative to %s, as 0 is %.0f extents away", root, origin, distance)
+    if not any(origin):
         return model, frame
-    log.info("%s: positions are relative to %s, as 0 is %.0f extents away", root, frame.middle, distance)
     views = np.stack([image.viewmat for image in model.images])
-    views[:, :3, 3] += views[:, :3, :3] @ frame.middle
+    views[:, :3, 3] += views[:, :3, :3] @ origin
     images = tuple(replace(image, viewmat=view) for image, view in zip(model.images, views, strict=True))
-    return replace(model, images=images, points=model.points - frame.middle), Frame(frame.unit, origin=frame.middle)
+    return replace(model, images=images, points=model.points - origin), frame.relative_to(origin)
 
 
 def astray(places: Float64s, times: float) -> Bools:

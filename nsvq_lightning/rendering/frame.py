@@ -6,6 +6,7 @@ extent is 5, as it is in most scenes of COLMAP: learning rates, first sizes and 
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -18,6 +19,9 @@ from nsvq_lightning.rendering.sampling import Sampling
 from nsvq_lightning.splats.conventions import Float32s, Float64s
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
+# World coordinates of what positions are relative to.
+Origin: TypeAlias = tuple[float, float, float]
+ZERO: Origin = (0.0, 0.0, 0.0)
 # Extent of the cameras in a frame.
 EXTENT = 5.0
 # Places are rounded to so many steps a unit, a thousandth of a pixel: cameras have the same bits in any unit.
@@ -38,8 +42,8 @@ class Frame:
     """
 
     unit: float = 1.0
-    middle: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    middle: Origin = ZERO
+    origin: Origin = ZERO
 
     @classmethod
     def around(cls, centres: Float64s) -> "Frame":
@@ -52,6 +56,11 @@ class Frame:
         extent = 1.1 * reach_of(np.linalg.norm(centres - middle, axis=1))
         x, y, z = middle.tolist()
         return cls(extent / EXTENT or 1.0, (x, y, z))
+
+    def relative_to(self, origin: Origin) -> "Frame":
+        """The same coordinates of files whose positions are relative to another origin."""
+        x, y, z = np.add(self.middle, np.subtract(self.origin, origin)).tolist()
+        return Frame(self.unit, (x, y, z), origin)
 
     @property
     def near(self) -> float:

@@ -399,7 +399,9 @@ class SplatModule(LightningModule):
         phase, degree, self.extent, self.stopwatch.seconds, unit, *places = state.tolist()
         self.phase = Phase(int(phase))
         self.active_sh_degree = int(degree)
-        self.frame = Frame(unit, tuple(places[:3]), tuple(places[3:]))
+        frame = Frame(unit, tuple(places[:3]), tuple(places[3:]))
+        scene = run_scene.scene_of(self._trainer)  # whose photos may be others, around another middle
+        self.frame = frame if scene is None else frame.relative_to(scene.frame.origin)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add history, schedule, quantizers and scene; plain data only, so that ``weights_only=True`` can read it."""

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from moved_scenes import write_moved
 from splat_scenes import random_splats
 
 from nsvq_lightning.commands.arguments import (
@@ -27,6 +28,7 @@ from nsvq_lightning.commands.arguments import (
     views_of,
 )
 from nsvq_lightning.data.scene import load_cameras, load_scene
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import read_scene, save
 
 
@@ -106,7 +108,7 @@ def test_cameras_of_inrias_trainer_lie_up_to_two_folders_above_the_scene(tmp_pat
     (scene.parents[above] / "cameras.json").write_text(json.dumps([ENTRY]))
     assert list(known_views(scene, None)[0]) == ["a"] * (above < 3)
     if above < 3:
-        views = views_of(scene, random_splats(9), 5, None)
+        views = views_of(scene, CompressedScene.from_splats(random_splats(9)), 5, None)
         assert [(view.width, view.height) for view in views] == [(8, 6)]
         assert views[0].position.tolist() == [0, 0, -6]
 
@@ -143,7 +145,7 @@ def test_photos_of_a_run_have_the_size_that_it_trained(
 
 
 def test_what_is_read_of_a_folder_is_all_that_loading_a_scene_takes() -> None:
-    assert {*READ} == signature(load_scene).parameters.keys() - {"root", "cache_bytes"}
+    assert {*READ} == signature(load_scene).parameters.keys() - {"root", "cache_bytes", "origin"}
 
 
 def test_cameras_of_a_run_are_of_the_model_that_it_trained(tmp_path: Path, demo_scene: Path) -> None:
@@ -180,7 +182,7 @@ def _without_photos(scene: Path, folder: Path) -> Path:
 def test_cameras_need_no_photos(tmp_path: Path, demo_scene: Path) -> None:
     expected = load_scene(demo_scene)
     points = expected.points[:50]
-    splats = random_splats(50)._replace(means=points)
+    scene = CompressedScene.from_splats(random_splats(50)._replace(means=points))
     root = _without_photos(demo_scene, tmp_path / "scene")
     path = tmp_path / "a" / "b" / "c.ply"
     path.parent.mkdir(parents=True)
@@ -191,10 +193,30 @@ def test_cameras_need_no_photos(tmp_path: Path, demo_scene: Path) -> None:
             torch.equal(one.viewmat, other.viewmat) for one, other in zip(found.values(), expected.cameras, strict=True)
         )
         assert [camera.intrinsics for camera in found.values()] == [each.intrinsics for each in expected.cameras]
-    assert len(views_of(path, splats, 4, root)) == 3
-    assert known_views(path, root, splats.means.numpy())[1] is None
+    assert len(views_of(path, scene, 4, root)) == 3
+    assert known_views(path, root, scene)[1] is None
     _without_photos(demo_scene, tmp_path / "a")  # beside the scene, a folder above
     assert tuple(known_views(path, None)[0]) == expected.names
+
+
+@pytest.mark.parametrize("photos_are_there", [True, False])
+def test_cameras_on_a_map_are_seen_from_the_scenes_origin(
+    tmp_path: Path, demo_scene: Path, photos_are_there: bool
+) -> None:
+    near, origin = load_scene(demo_scene), (5e5, 4.1e6, 120.0)
+    far = write_moved(demo_scene, tmp_path / "far", shift=origin)
+    if not photos_are_there:
+        (far / "images").unlink()
+    scene = replace(CompressedScene.from_splats(random_splats(50)._replace(means=near.points[:50])), origin=origin)
+    cameras, photos = known_views(tmp_path / "scene.nsvq", far, scene)
+    assert load_scene(demo_scene).frame.origin == (0, 0, 0)
+    for found in (list(cameras.values()), photos.cameras if photos else views_of(tmp_path, scene, 9, far)):
+        for one, other in zip(found, near.cameras, strict=True):
+            torch.testing.assert_close(one.viewmat, other.viewmat, atol=1e-5, rtol=0)
+    if photos:
+        torch.testing.assert_close(photos.points, near.points, atol=1e-5, rtol=0)
+        assert photos.frame.origin == origin
+        np.testing.assert_allclose(photos.frame.middle, near.frame.middle, atol=1e-5)
 
 
 def test_cameras_of_another_scene_are_not_used(
@@ -203,15 +225,15 @@ def test_cameras_of_another_scene_are_not_used(
     root = _without_photos(demo_scene, tmp_path / "scene")
     path = root / "scene.ply"
     points = load_scene(demo_scene).points
-    own = random_splats(len(points))._replace(means=points)
-    moved = own._replace(means=points + 20)
-    for splats, count in ((own, 9), (moved, 0)):
-        save(splats, path)
+    own = CompressedScene.from_splats(random_splats(len(points))._replace(means=points))
+    moved = replace(own, means=own.means + 20)
+    for scene, count in ((own, 9), (moved, 0)):
+        save(scene, path)
         assert len(trained_scene(path, None).cameras) == count
-        assert len(known_views(path, None, splats.means.numpy())[0]) == count
+        assert len(known_views(path, None, scene)[0]) == count
     assert "scene.ply: the cameras of the folders beside it are not used: 9 cameras show " in caplog.text
     for wrong in (root, demo_scene):
-        assert known_views(path, wrong, moved.means.numpy()) == ({}, None)
+        assert known_views(path, wrong, moved) == ({}, None)
         assert f"the cameras of {wrong} are not used: 9 cameras show" in caplog.text
 
 

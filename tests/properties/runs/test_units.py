@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from checkpoints import read
@@ -55,6 +56,26 @@ def test_a_run_is_the_same_in_any_unit(
     assert any(second.origin) == (shift[0] > 1e4)
     middle = np.median(second.means, axis=0) + second.origin
     np.testing.assert_allclose(middle, unit * np.median(first.means, axis=0) + shift, atol=0.05 * unit)
+
+
+def test_a_map_stays_in_its_place_when_photos_go(demo_scene: Path, tmp_path: Path) -> None:
+    far = write_moved(demo_scene, tmp_path / "far", shift=(5e5, 4.1e6, 120.0))
+    fitted(far, tmp_path / "run")
+    checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
+    model = pycolmap.Reconstruction(str(far / "sparse" / "0"))
+    names = sorted(image.name for image in model.images.values())
+    for image in list(model.images.values()):
+        if image.name in names[3:6]:
+            model.deregister_frame(image.frame_id)
+    model.write_binary(str(far / "sparse" / "0"))
+    scene = read_scene(tmp_path / "run" / "scene.nsvq")
+    assert np.abs(np.subtract(load_scene(far).frame.origin, scene.origin)).max() > 0.05
+    options = [f"--data.root={far}", f"--trainer.run_folder={tmp_path / 'again'}", "--trainer.accelerator=cpu"]
+    assert main(["test", f"--ckpt_path={checkpoint}", *options]) == 0
+    again = read_scene(tmp_path / "again" / "scene.nsvq")
+    assert again.origin == load_scene(far).frame.origin
+    means = [found.means.mean(0, np.float64) + found.origin for found in (scene, again)]
+    np.testing.assert_allclose(*means, atol=0.02, rtol=0)  # of rounded positions
 
 
 def test_a_checkpoint_puts_its_scene_back(demo_scene: Path, usual: Path, tmp_path: Path) -> None:
