@@ -50,9 +50,9 @@ class MetricReport(WritingCallback):
     """Writes the results of a run to its folder.
 
     During training: test PSNR and SSIM, number of splats and training seconds at the end of each phase and every
-    ``every`` iterations, in ``curve.csv``, ``curve.png`` and ``report.html``, a page that can be left open in a browser
-    and shows one view as it becomes better. An evaluation renders what a file written at that moment
-    would decode to. It does not count as training time.
+    ``every`` iterations, in ``curve.csv`` and ``report.html``, a page that can be left open in a browser and shows one
+    view as it becomes better. An evaluation renders what a file written at that moment would decode to. It does not
+    count as training time.
 
     Evaluations take the place of Lightning's validation: ``report/psnr``, ``report/ssim`` and ``report/splats`` go to
     the loggers and to ``trainer.callback_metrics``, and ``EarlyStopping(monitor="report/psnr", mode="max")`` or a
@@ -114,20 +114,12 @@ class MetricReport(WritingCallback):
         self._evaluate_once(trainer, module)
 
     def on_train_end(self, trainer: Trainer, module: SplatModule) -> None:
-        """Evaluate the end of the run if no epoch has ended, and draw the curve."""
+        """Evaluate the end of the run if no epoch has ended."""
         self._evaluate_once(trainer, module)
-        folder = run_folder(trainer)
-        if trainer.is_global_zero and module.history and not is_fast_dev_run(trainer):
-            with module.stopwatch.paused(module.device):
-                with optional(folder / "curve.csv") as path:
-                    numbers.write_csv(path, module.history)
-                with optional(folder / "curve.png") as path:
-                    pictures.write_figure(path, pictures.curve_figure(module.history, module.schedule))
 
     def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Catch up for a run that was stopped after its last iteration: when continued, it trains no further."""
-        if trainer.global_step and not (run_folder(trainer) / "curve.png").exists():
-            self.on_train_end(trainer, module)
+        self._evaluate_once(trainer, module)
 
     def _evaluate_once(self, trainer: Trainer, module: SplatModule) -> None:
         """Evaluate an iteration that was not evaluated yet, and notify the callbacks that monitor it."""

@@ -291,7 +291,7 @@ def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> 
     The tables are written anew after each run, so they are complete whenever this is interrupted.
 
     Args:
-        output: Where ``results.csv``, ``results.md`` and ``results.png`` go.
+        output: Where ``results.csv`` and ``results.md`` go.
         runs: The runs.
         keep_checkpoints: Keep those of finished runs, too.
 

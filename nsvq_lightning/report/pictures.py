@@ -1,4 +1,4 @@
-"""What a run shows: pictures of its views, its curve, and videos, under names that every file system has."""
+"""What a run shows: pictures of its views, and videos, under names that every file system has."""
 
 import logging
 import os
@@ -7,11 +7,11 @@ import shutil
 import subprocess
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from hashlib import sha256
-from itertools import count, cycle
+from itertools import count
 from pathlib import Path
 from typing import Any
 from unicodedata import normalize
@@ -22,9 +22,8 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
 from nsvq_lightning.data.images import read_image, write_pixels
-from nsvq_lightning.io.atomic import atomic_path, atomic_write, make_folder_of
+from nsvq_lightning.io.atomic import atomic_path, make_folder_of
 from nsvq_lightning.splats.conventions import Uint8s
-from nsvq_lightning.training.schedule import Phase, Schedule
 
 log = logging.getLogger(__name__)
 
@@ -167,34 +166,3 @@ def frame_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
         yield lambda picture: write_png(next(names), picture)
         if (older := next(names)).exists():
             log.warning("%s, and what may follow, are frames of an earlier render", older)
-
-
-def write_figure(path: Path, figure: Any) -> None:
-    """Write a figure as PNG, cropped to its content, atomically."""
-    with atomic_write(path) as file:
-        figure.savefig(file, format="png", bbox_inches="tight")
-
-
-def curve_figure(history: Sequence[Mapping[str, Any]], schedule: Schedule) -> Any:
-    """PSNR and number of splats over the iterations, with phases shaded, as a Matplotlib figure."""
-    # pyplot is not used, as it keeps global state and may look for a display.
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 4), layout="constrained")  # inches
-    quality = figure.add_subplot()
-    number = quality.twinx()
-    iterations = [entry["iteration"] for entry in history]
-    colours = "#dfe8f5", "#f8e6d0", "#dcefdc", "#efe0f0"
-    start = 0
-    for phase, end, colour in zip(Phase, schedule.ends, cycle(colours), strict=False):
-        if end > start:
-            quality.axvspan(start, end, color=colour, label=phase.name.lower(), linewidth=0)
-        start = end
-    quality.plot(iterations, [entry["psnr"] for entry in history], "o-", color="#1f4e9c", markersize=3)
-    number.plot(iterations, [entry["splats"] for entry in history], "-", color="#b5651d")
-    quality.set(xlabel="iteration", xlim=(0, max(schedule.ends[-1], 1)))
-    quality.set_ylabel("test PSNR, dB", color="#1f4e9c")
-    number.set_ylabel("splats", color="#b5651d")
-    number.set_ylim(bottom=0)
-    quality.legend(loc="lower right", fontsize="small")
-    return figure

@@ -13,7 +13,7 @@ from nsvq_lightning.callbacks import MetricReport
 from nsvq_lightning.commands.fit import RunLogger
 from nsvq_lightning.commands.main import main
 
-HELD = ("curve.csv", "curve.png", "report.html", "preview.png", "views.csv", "viewer.html", "scene.ply", "view_000.png")
+HELD = ("curve.csv", "report.html", "preview.png", "views.csv", "viewer.html", "scene.ply", "view_000.png")
 
 
 @pytest.fixture

@@ -49,7 +49,7 @@ def finished(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 def test_a_run_leaves_scene_report_config_and_checkpoint(finished: Path) -> None:
     names = {path.name for path in finished.iterdir()}
     assert {"scene.nsvq", "scene.ply", "viewer.html", "report.html", "renders", "config.yaml", "checkpoints"} <= names
-    assert {"metrics.json", "views.csv", "curve.csv", "curve.png", "metrics.csv"} <= names
+    assert {"metrics.json", "views.csv", "curve.csv", "metrics.csv"} <= names
     config = yaml.safe_load((finished / "config.yaml").read_text())
     assert config["model"]["quantizer"]["init_args"] == {"kmeans_steps": 3, "start": "sample"}
     assert config["model"]["codebooks"] == {"scales": 16, "sh0": 8}

@@ -15,7 +15,7 @@ import torch
 from chromium import chromium, needs_chromium
 
 from nsvq_lightning.report.page import write_page
-from nsvq_lightning.report.pictures import comparison, curve_figure, write_png
+from nsvq_lightning.report.pictures import comparison, write_png
 from nsvq_lightning.training.schedule import Phase, Schedule
 
 SCHEDULE = Schedule(total=450)
@@ -160,13 +160,3 @@ def test_a_picture_that_is_none_any_more_is_named(run: Path) -> None:
     with pytest.raises(OSError, match=r"a\.png is not a picture any more; run 'nsvq test' again"):
         write_page(run, HISTORY, SCHEDULE, {}, METRICS, VIEWS)
     assert not (run / "report.html").exists()
-
-
-def test_curve_shades_the_phases_where_they_are() -> None:
-    quality, count = curve_figure([*HISTORY, _entry(450, "finetune", math.inf, 1.0)], SCHEDULE).axes
-    to_data = quality.transData.inverted()  # the class of the patches changes with matplotlib
-    ends = [to_data.transform_bbox(patch.get_window_extent()).x1 for patch in quality.patches]
-    assert ends == pytest.approx(SCHEDULE.ends)
-    assert [patch.get_label() for patch in quality.patches] == ["warmup", "prune", "quantize", "finetune"]
-    assert quality.lines[0].get_ydata()[-2] == HISTORY[-1]["psnr"]
-    assert count.lines[0].get_ydata()[0] == HISTORY[0]["splats"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -24,33 +24,10 @@ from runs import (
 
 from nsvq_lightning.callbacks import OPTIONAL, STANDARD, DensityControl, MetricReport, RunCheckpoint, standard
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.report import pictures
 from nsvq_lightning.training.module import SplatModule
 
 STEPS = 60
 CODES = {"scales": 24, "quats": 24, "sh0": 16, "shN": 16}
-
-
-DRAWN: list[bytes] = []
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_curve(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Draw one curve for all runs: each would take as long as its training. The other tests look at what it shows."""
-    if request.path.parent.name not in ("commands", "runs", "training") or request.path.stem == "test_sweep":
-        yield
-        return
-    draw = pictures.write_figure
-
-    def draw_once(path: Path, figure: Any) -> None:
-        if not DRAWN:
-            draw(path, figure)
-            DRAWN.append(path.read_bytes())
-        path.write_bytes(DRAWN[0])
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pictures, "write_figure", draw_once)
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -115,7 +115,6 @@ def test_the_report_measures_the_decoded_file(paper: Whole, demo_scene: Path) ->
     rows = list(csv.DictReader((folder / "views.csv").open()))
     assert [float(row["psnr"]) for row in rows] == pytest.approx(expected, abs=1e-3)
     assert [row["iteration"] for row in csv.DictReader((folder / "curve.csv").open())] == ["20", "27", "40", "57", "60"]
-    assert (folder / "curve.png").stat().st_size > 1000
     assert len(list((folder / "renders").iterdir())) == len(rows)
     assert not [path for path in folder.rglob("*") if path.suffix == ".tmp"]
 
