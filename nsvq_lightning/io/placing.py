@@ -39,6 +39,10 @@ def turn_up(up: Float64s, axis: str) -> Float64s:
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
+# From so many times the distance that four fifths of the splats have from their middle, float32 would be too coarse.
+FAR = 100.0
+
+
 def rotated(scene: CompressedScene, rotation: Float64s) -> CompressedScene:
     """The scene turned about the world's origin, and scaled, by a matrix ``[3, 3]``, see :func:`moved`."""
     return moved(scene, np.c_[rotation, np.zeros(3)])
@@ -48,7 +52,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     """The scene turned, scaled and moved.
 
     Positions, scales, rotations and spherical harmonics change, the last three by the rows of their codebooks; numbers
-    are rounded once, to float32.
+    are rounded once, to float32. What moves far away, as to a map, moves by its origin.
 
     Args:
         scene: The scene.
@@ -60,6 +64,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     """
     import torch
 
+    from nsvq_lightning.rendering.frame import middle_of
     from nsvq_lightning.rendering.sh import sh_rotation
 
     linear, shift = matrix[:3, :3], matrix[:3, 3]
@@ -77,11 +82,10 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
         coefficients = rows.reshape(len(rows), len(harmonics), 3)
         return (harmonics @ coefficients).reshape(rows.shape)
 
-    origin = linear @ scene.origin
-    if any(scene.origin):  # which moves, then, and not what is relative to it
-        origin += shift
+    means, origin = scene.means @ linear.T, linear @ scene.origin
+    if any(scene.origin) or np.linalg.norm(shift) > FAR * middle_of(means)[1] > 0:
+        origin += shift  # which moves, then, and not what is relative to it
         shift = np.zeros(3)
-    means = scene.means @ linear.T + shift
     cameras = scene.cameras.copy()
     cameras[:, :3] = cameras[:, :3] @ linear.T + shift
     return scene.changed(
@@ -90,7 +94,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
             "quats": lambda rows: turned(rows, rotation),
             "shN": turned_harmonics,
         },
-        means=means.astype(np.float32),
+        means=(means + shift).astype(np.float32),
         origin=tuple(origin.tolist()),
         cameras=cameras,
     )

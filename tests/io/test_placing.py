@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.compression.viewpoints import look_at
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.placing import UP_AXES, rotated, turn_up
+from nsvq_lightning.io.placing import UP_AXES, moved, rotated, turn_up
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.rendering.rasterize import render
@@ -55,6 +55,17 @@ def test_a_turned_scene_is_the_same_scene(degree: int, kind: str) -> None:
     expected = picture(scene, before)
     assert expected.std() > 0.01
     torch.testing.assert_close(picture(turned, after), expected, rtol=0, atol=2e-5)
+
+
+def test_a_scene_keeps_its_detail_on_a_map() -> None:
+    scene = ball(200)
+    shift = np.array([4.1e6, 6.3e5, 4.8e6])
+    there = moved(scene, np.c_[np.eye(3), shift])
+    np.testing.assert_array_equal(there.means, scene.means)
+    assert there.origin == tuple(shift)
+    near = moved(scene, np.c_[np.eye(3), [4.0, 0.0, -2.0]])
+    assert near.origin == scene.origin
+    np.testing.assert_allclose(near.means, scene.means + np.array([4.0, 0.0, -2.0]), atol=1e-6)
 
 
 def cameras_with_up(up: NDArray[np.float64], roll: float = 0.0) -> list[Camera]:
