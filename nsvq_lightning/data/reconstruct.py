@@ -429,8 +429,10 @@ def _copy(path: Path, target: Path) -> Path:
         kind, suffixes = ("PNG", (".png",)) if is_lossless else ("JPEG", (".jpg", ".jpeg"))
         if path.suffix.lower() not in (PHOTOS if as_is else suffixes):
             target = target.with_suffix(suffixes[0])
-        if not in_place and target.exists() and target.stat().st_mtime == path.stat().st_mtime:
-            return target
+        if not in_place and target.exists():
+            old, new = target.stat(), path.stat()
+            if old.st_mtime == new.st_mtime and not (as_is and old.st_size != new.st_size):
+                return target
         image.load()
         content = path.read_bytes() if as_is else _converted(image, path, kind)
     if target != path:

@@ -1,6 +1,7 @@
 """A scene: registered views with pinhole cameras, sparse points, the split into train and test, and photos' detail."""
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -293,11 +294,24 @@ def _image_sources(
     for kind in dict.fromkeys(kinds):
         number, size = kind
         full, undistortion = rectify(model.cameras[number], *size, keep_maps=keep_maps)
+        _warn_of_lens(number, full, size)
         lenses[kind] = undistortion, _scaled(full, divisor, max_width)
     return [
         ImageSource(path, head.size, *lenses[kind], head.orientation, mask, head.has_alpha, model.synthetic)
         for path, head, kind, mask in zip(paths, heads, kinds, masks, strict=True)
     ]
+
+
+def _warn_of_lens(number: int, lens: Pinhole, size: tuple[int, int]) -> None:
+    """Warn of numbers that lenses hardly have, and of undistortion that leaves less than half of photos of a size."""
+    (fx, _, cx), (_, fy, cy) = lens.K[:2].tolist()
+    is_usual = 0.5 < fx / fy < 2 and 0.1 < cx / lens.width < 0.9 and 0.1 < cy / lens.height < 0.9
+    if not is_usual or 2 * lens.width * lens.height < math.prod(size):
+        log.warning(
+            f"camera {number} is odd: focal lengths {fx:.4g} and {fy:.4g}, centre ({cx:.4g}, {cy:.4g}), and "
+            f"{lens.width}x{lens.height} of {size[0]}x{size[1]} pixels are left without distortion: were photos "
+            "scaled, cropped or turned after it was calibrated?"
+        )
 
 
 def _scaled(lens: Pinhole, divisor: int, max_width: int | None) -> Pinhole:

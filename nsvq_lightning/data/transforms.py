@@ -305,11 +305,14 @@ def _listed(head: Mapping[str, Any], frames: Mapping[str, _Frame]) -> tuple[set[
     names |= {name: name for name in frames}
 
     def listed(part: str) -> set[str]:
-        """Those of a list, and an empty name for all others in it."""
+        """Those of a list; a warning counts what in it is no photo."""
         given = head.get(f"{part}_filenames")
-        return {names.get(_plain(str(name)), "") for name in given} if isinstance(given, list) else set()
+        found = [names.get(_plain(str(name))) for name in given] if isinstance(given, list) else []
+        if missing := found.count(None):
+            log.warning("%d of %d names in %s_filenames are of no photo in the file", missing, len(found), part)
+        return set(filter(None, found))
 
-    return listed("train") - {""}, (listed("test") or listed("val")) - {""}
+    return listed("train"), listed("test") or listed("val")
 
 
 def _plain(path: str) -> str:

@@ -206,6 +206,8 @@ def check_scene(checkpoint: Mapping[str, Any], scene: Scene) -> None:
         ValueError: It is of another one.
     """
     stored, own = checkpoint[SCENE], scene_record(scene)
+    if stored["views"].keys() != own["views"].keys():
+        log.warning("%s has other photos than it was trained on: some of these may be test views now", scene.root)
     common = stored["views"].keys() & own["views"].keys()
     same = sum(stored["views"][name] == own["views"][name] for name in common)
     if not common or 2 * same < len(common):  # not all: rounding may turn out otherwise

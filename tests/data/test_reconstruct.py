@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -178,6 +179,14 @@ def test_copies_follow_their_photos(folders: tuple[Path, Path]) -> None:
     names = _copied(source, target)
     assert names == ["other.png", "same.jpg"]
     before = (target / "same.jpg").stat().st_ino
+    PIL.Image.fromarray(_texture(40)).save(source / "other.png")
+    assert _copied(source, target) == names
+    os.utime(source / "other.png", ns=(0, 0))
+    assert _copied(source, target) == names
+    PIL.Image.fromarray(_texture(50)).save(source / "other.png", compress_level=1)
+    os.utime(source / "other.png", ns=(0, 0))  # as programs do that keep times
+    assert _copied(source, target) == names
+    assert np.array_equal(read_image(target / "other.png"), _texture(50))
     PIL.Image.fromarray(_texture(40)).save(source / "other.png")
     assert _copied(source, target) == names
     assert (target / "same.jpg").stat().st_ino == before  # a copy has a new one

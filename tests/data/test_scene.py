@@ -44,6 +44,25 @@ def test_a_scene_far_from_the_origin_has_another(
         torch.testing.assert_close(one.viewmat, other.viewmat, atol=2e-5, rtol=0)
 
 
+@pytest.mark.parametrize(
+    ("model", "params", "is_odd"),
+    [
+        ("PINHOLE", (30.0, 31.0, 21.0, 15.0), False),
+        ("PINHOLE", (30.0, 31.0, 33.0, 9.0), False),  # cropped
+        ("PINHOLE", (30.0, 31.0, 0.5, 0.5), True),  # in shares
+        ("PINHOLE", (60.0, 62.0, 42.0, 30.0), True),  # of photos twice as large
+        ("PINHOLE", (30.0, 80.0, 21.0, 15.0), True),
+        ("SIMPLE_RADIAL", (30.0, 20.0, 16.0, 0.1), False),
+        ("SIMPLE_RADIAL", (30.0, 20.0, 16.0, -30.0), True),
+    ],
+)
+def test_numbers_that_no_lens_has_are_told(
+    make_scene: SceneFactory, caplog: pytest.LogCaptureFixture, model: str, params: tuple[float, ...], is_odd: bool
+) -> None:
+    load_scene(make_scene(model=model, params=params))
+    assert ("camera 1 is odd: focal lengths " in caplog.text) == is_odd
+
+
 def test_what_is_far_from_all_others_is_named(
     make_scene: SceneFactory, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

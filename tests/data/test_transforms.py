@@ -166,6 +166,10 @@ def test_lists_of_train_and_test_photos_are_followed(
     assert scene.names == ("000.png", "001.png", "002.png", "003.png", "005.png")
     assert (scene.test, scene.train) == ((3,), (0, 1, 2, 4))
     assert "4 of 9 photos are not used, by its lists" in caplog.text
+    assert "filenames" not in caplog.text
+    change(root / "transforms.json", val_filenames=["images/003.png", "images/004.jpeg", 7])
+    assert load_scene(root).test == (3,)
+    assert "2 of 3 names in val_filenames are of no photo in the file" in caplog.text
     change(root / "transforms.json", val_filenames=["images/001.png"])
     with pytest.raises(SceneError, match=r"001\.png is a train and a test photo"):
         load_scene(root)

@@ -133,14 +133,18 @@ def test_what_the_user_has_named_is_loaded() -> None:
     check_settings("a.ckpt", {"quantizer": {"class_path": NAMED, "init_args": {"table": "a/b.txt"}}}, ["a/b.txt"])
 
 
-def test_a_scene_is_the_same_with_other_photos_in_another_place(demo_scene: Path, tmp_path: Path) -> None:
+def test_a_scene_is_the_same_with_other_photos_in_another_place(
+    demo_scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     checkpoint = {"scene": scene_record(load_scene(demo_scene))}
     assert checkpoint["scene"]["folder"] == demo_scene.name
     moved = shutil.copytree(demo_scene, tmp_path / "moved")
     (moved / "masks").mkdir()
     fewer = load_scene(moved, factor=2, test_every=3)
     check_scene(checkpoint, fewer)
+    assert "other photos" not in caplog.text
     check_scene(checkpoint, replace(fewer, names=fewer.names[2:], cameras=fewer.cameras[2:]))
+    assert "moved has other photos than it was trained on" in caplog.text
     for other in (
         replace(fewer, names=fewer.names[::-1]),
         replace(fewer, names=tuple(f"cam/{name}" for name in fewer.names)),
