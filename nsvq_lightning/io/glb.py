@@ -42,7 +42,7 @@ _COMPONENTS = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", _
 
 
 def write_glb(path: StrPath, scene: CompressedScene) -> int:
-    """Write a scene as ``.glb``, in float32.
+    """Write a scene as ``.glb``, in float32; the translation of its node, in float64, is its origin.
 
     Returns:
         Bytes of the file.
@@ -96,7 +96,7 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0, "translation": scene.origin}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,

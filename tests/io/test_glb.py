@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,18 @@ def test_it_holds_what_the_extension_says(tmp_path: Path, degree: int) -> None:
     for number, name in enumerate(names):
         expected = SIGNS[number] * plain.shN[:, number]
         np.testing.assert_allclose(attribute(document, data, name), expected, atol=1e-6)
+
+
+def test_a_scene_on_a_map_is_there_to_a_millimetre(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    origin = (4.1e6 + 1 / 1024, -6.3e5, 120.25)
+    scene = replace(plain_scene(50, 1), origin=origin)
+    save(scene, tmp_path / "x.glb")
+    assert not caplog.text
+    document, _ = parts(tmp_path / "x.glb")
+    assert document["nodes"] == [{"mesh": 0, "translation": [-origin[0], -origin[1], origin[2]]}]
+    again = read_scene(tmp_path / "x.glb")
+    assert again.origin == origin
+    np.testing.assert_array_equal(again.means, scene.means)
 
 
 def test_covariances_are_turned_half_around_z(tmp_path: Path) -> None:
