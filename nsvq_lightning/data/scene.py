@@ -25,7 +25,7 @@ from nsvq_lightning.data.points import random_points
 from nsvq_lightning.data.transforms import read_poses
 from nsvq_lightning.data.undistortion import rectify
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.frame import EXTENT, ZERO, Frame, Origin, middle_of
+from nsvq_lightning.rendering.frame import EXTENT, ZERO, Frame, Place, middle_of
 from nsvq_lightning.splats.conventions import Bools, Float64s
 
 log = logging.getLogger(__name__)
@@ -157,7 +157,7 @@ def load_scene(
     model: str | None = None,
     masks: str | None = "masks",
     allow_outside: bool = False,
-    origin: Origin = ZERO,
+    origin: Place = ZERO,
 ) -> Scene:
     """Load a scene: photos, and the cameras of a COLMAP model (binary or text) or of a transforms file.
 
@@ -324,7 +324,7 @@ def load_cameras(
     factor: Factor | None = None,
     max_width: int | None = 1600,
     model: str | None = None,
-    origin: Origin = ZERO,
+    origin: Place = ZERO,
     **rest: Any,
 ) -> dict[str, Camera]:
     """Cameras of a scene folder by the names of its photos, which need not be there; those of :func:`load_scene`.
@@ -386,7 +386,7 @@ def usable(scene: Scene) -> Scene:
     return replace(scene, train=train, test=test)
 
 
-def _framed(model: ColmapModel, root: Path, origin: Origin) -> tuple[ColmapModel, Frame]:
+def _framed(model: ColmapModel, root: Path, origin: Place) -> tuple[ColmapModel, Frame]:
     """The frame of a model's cameras, and the model with an origin near them; warns of cameras that went astray."""
     centres = np.stack([image.centre for image in model.images])
     frame = Frame.around(centres)

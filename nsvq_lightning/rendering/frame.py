@@ -19,9 +19,9 @@ from nsvq_lightning.rendering.sampling import Sampling
 from nsvq_lightning.splats.conventions import Float32s, Float64s
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
-# World coordinates of what positions are relative to.
-Origin: TypeAlias = tuple[float, float, float]
-ZERO: Origin = (0.0, 0.0, 0.0)
+# x, y, z in the world.
+Place: TypeAlias = tuple[float, float, float]
+ZERO: Place = (0.0, 0.0, 0.0)
 # Extent of the cameras in a frame.
 EXTENT = 5.0
 # Places are rounded to so many steps a unit, a thousandth of a pixel: cameras have the same bits in any unit.
@@ -42,8 +42,8 @@ class Frame:
     """
 
     unit: float = 1.0
-    middle: Origin = ZERO
-    origin: Origin = ZERO
+    middle: Place = ZERO
+    origin: Place = ZERO
 
     @classmethod
     def around(cls, centres: Float64s) -> "Frame":
@@ -57,7 +57,7 @@ class Frame:
         x, y, z = middle.tolist()
         return cls(extent / EXTENT or 1.0, (x, y, z))
 
-    def relative_to(self, origin: Origin) -> "Frame":
+    def relative_to(self, origin: Place) -> "Frame":
         """The same coordinates of files whose positions are relative to another origin."""
         x, y, z = np.add(self.middle, np.subtract(self.origin, origin)).tolist()
         return Frame(self.unit, (x, y, z), origin)
