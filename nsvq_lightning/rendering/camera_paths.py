@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
-from torch import Tensor
 
 from nsvq_lightning.rendering.camera import Camera, camera_of
 from nsvq_lightning.rendering.frame import Frame
@@ -158,7 +157,7 @@ def _entry_camera(entry: Mapping[str, Any], width: int, height: int) -> Camera:
         raise ValueError(f"a field of view is {field} degrees")
     focal = 0.5 * height / math.tan(math.radians(field) / 2)
     rotation = pose[:3, :3] * [1, -1, -1]  # from y up, looking along -z, to y down, looking along z
-    return camera_of(_rigid_view(rotation, pose[:3, 3]), (focal, focal, width / 2, height / 2), width, height)
+    return camera_of(view_from(rotation, pose[:3, 3]), (focal, focal, width / 2, height / 2), width, height)
 
 
 # File beside a scene of INRIA's trainer, or two folders above it.
@@ -196,7 +195,7 @@ def read_cameras(path: Path) -> dict[str, Camera]:
             times = _times_smaller(path.with_name("cfg_args"), width)
             small = tuple(number / times for number in lens)
             size = round(width / times), round(height / times)
-            cameras[name] = camera_of(_rigid_view(rotation, position), small, *size)
+            cameras[name] = camera_of(view_from(rotation, position), small, *size)
     if not cameras:
         return {}
     near = Frame.around(poses(list(cameras.values()))[0]).near
@@ -211,19 +210,6 @@ def _times_smaller(arguments: Path, width: int) -> float:
     if asked in (1, 2, 4, 8):
         return asked
     return width / asked if asked > 0 else max(1.0, width / 1600)
-
-
-# Coordinates below this float32 holds with room to spare.
-_MAX_COORDINATE = 1e30
-
-
-def _rigid_view(rotation: Float64s, position: Float64s) -> Tensor:
-    """:func:`~nsvq_lightning.rendering.poses.view_from` of numbers that may be anything."""
-    is_rigid = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-    is_place = position.shape == (3,) and (np.abs(position) < _MAX_COORDINATE).all()
-    if not (is_rigid and is_place and np.linalg.det(rotation) > 0):
-        raise ValueError("a pose is not a rotation and a position")
-    return view_from(rotation, position)
 
 
 def _arc(angles: Float64s) -> tuple[float, float]:

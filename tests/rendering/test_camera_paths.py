@@ -177,7 +177,7 @@ def test_other_files_are_refused(tmp_path: Path, text: str, words: str) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"scale": 2.0}, "not a rotation and a position"),
+        ({"scale": 2.0}, "must be world to camera, a rotation and a translation"),
         ({"fov": 180.0}, "field of view is 180"),
         ({"last": 2.0}, "rigid"),
     ],
@@ -230,11 +230,11 @@ def test_cameras_of_inrias_trainer_have_the_size_it_trained(
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, "not a rotation and a position"),
-        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "not a rotation and a position"),
-        ({"rotation": [[1, 0], [0, 1]]}, "not a rotation and a position"),
-        ({"position": [0, float("nan"), 0]}, "not a rotation and a position"),
-        ({"position": [0, 1e300, 0]}, "not a rotation and a position"),
+        ({"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, "must be world to camera, a rotation and a translation"),
+        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "must be world to camera, a rotation and a translation"),
+        ({"rotation": [[1, 0], [0, 1]]}, "could not broadcast"),
+        ({"position": [0, float("nan"), 0]}, "must be world to camera, a rotation and a translation"),
+        ({"position": [0, 1e300, 0]}, "must be world to camera, a rotation and a translation"),
         ({"position": [0, "x", 0]}, "could not convert"),
         ({"width": 10**9}, "a picture of 1000000000x"),
         ({"height": 0}, "numbers of pixels, at least one"),
