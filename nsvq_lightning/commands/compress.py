@@ -139,7 +139,7 @@ def _write_file(options: argparse.Namespace, compressor: "Compressor", most: int
     candidate = compressor.best(most, options.codebooks, options.target_bytes, options.max_error)
     make_folder_of(options.output)
     write_bytes(options.output, candidate.data)
-    before, after = options.input.stat().st_size, len(candidate.data)
+    before, after = compressor.scene.stored_bytes or 0, len(candidate.data)
     sizes = candidate.setting.codebooks
     books = "no codebooks" if sizes == "none" else f"codebooks {sizes}"
     error = written_error(compressor.measure, compressor.error(candidate), "the original")

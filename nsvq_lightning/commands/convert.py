@@ -116,6 +116,8 @@ def _contradiction(options: argparse.Namespace) -> str:
         return "--data.root says where to measure: add --measure"
     if options.measure and (moves or options.crop or options.floaters or options.splats or len(options.inputs) > 1):
         return "--measure compares with the input as it is: convert without it first"
+    if options.measure and options.output.exists() and options.output.samefile(options.inputs[0]):
+        return "--measure compares with the input, which would be overwritten: name another output"
     for name, suffixes in WRITER_OPTIONS.items():
         if getattr(options, name) is not None and formats.suffix_of(options.output) not in suffixes:
             flag = name.replace("_", "-")

@@ -106,10 +106,14 @@ def own_scene(
         photos: Of each camera ``[H, W, 3]`` RGB, uint8, or float in [0, 1]; none for the scene's own pictures.
 
     Raises:
-        ValueError: There is not one photo of the camera's size for each camera.
+        ValueError: There is not one photo of the camera's size for each camera, or its numbers are of another kind.
     """
     if photos and [photo.shape for photo in photos] != [(camera.height, camera.width, 3) for camera in cameras]:
         raise ValueError(f"expected a photo [H, W, 3] of its size for each of {len(cameras)} cameras")
+    for number, photo in enumerate(photos):
+        if photo.dtype != torch.uint8 and not (photo.is_floating_point() and photo.max() < 2):
+            text = f"photo {number} is {photo.dtype} of up to {photo.max():g}"
+            raise ValueError(f"{text}: photos must be uint8, or float in [0, 1]")
     split = "1 in 8" if photos else OWN
     bytes_ = [
         (255 * eight_bit(photo.cpu())).round().to(torch.uint8) for photo in photos or pictures(splats, cameras, look)

@@ -191,6 +191,11 @@ class CompressedScene:
             else:
                 raw[name] = np.concatenate([scene.rows(name) for scene in scenes])
         scenes = [scene.relative_to(first.origin) for scene in scenes]
+        cameras = [scene.cameras for scene in scenes]
+        if not all(map(len, cameras)):
+            if any(map(len, cameras)):
+                log.warning("of some scenes the cameras of their training are known, of some not: none are kept")
+            cameras = [np.zeros((0, 4))]
         return cls(
             np.concatenate([scene.means for scene in scenes]),
             np.concatenate([scene.opacities for scene in scenes]),
@@ -200,7 +205,7 @@ class CompressedScene:
             sh_degree=degree,
             config=first.config,
             origin=first.origin,
-            cameras=fewer_cameras(np.concatenate([scene.cameras for scene in scenes])),
+            cameras=fewer_cameras(np.concatenate(cameras)),
         )
 
     def __len__(self) -> int:

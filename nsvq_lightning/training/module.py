@@ -71,7 +71,8 @@ class SplatModule(LightningModule):
         seed: Seed of every draw of the run except the order of the views.
         storage: Level of the compressed file, and how exactly it stores the scene.
         init_from: Scene file of any format to start from, without its non-finite splats.
-        splats: Splats to start from, for use from Python. A fit takes them into the :attr:`frame` of its scene.
+        splats: Splats to start from, for use from Python, which are copied. A fit takes them into the :attr:`frame` of
+            its scene.
 
     Attributes:
         splats: The splats, in :attr:`frame`; rows are edited only through :mod:`nsvq_lightning.training.row_ops`.
@@ -126,7 +127,7 @@ class SplatModule(LightningModule):
             raise ValueError(f"background must be auto, black, white or random, got {background!r}")
         if not 0.0 <= dssim_weight <= 1.0:
             raise ValueError(f"dssim_weight must be between 0 and 1, got {dssim_weight}")
-        self.splats = splats if splats is not None else Splats(sh_degree)
+        self.splats = Splats(sh_degree) if splats is None else Splats.from_tensors(*detached(splats))
         self.codebooks = nn.ModuleDict(build_quantizers(quantizer, codebooks, self.splats))
         self.quantizer_settings = {
             name: {"quantizer": type(made).__name__, "codes": len(made.codebook)}
@@ -148,7 +149,7 @@ class SplatModule(LightningModule):
         self.extent = 0.0
         self.schedule = Schedule()
         self.phase = Phase.WARMUP
-        self.active_sh_degree = 0 if splats is None else splats.sh_degree
+        self.active_sh_degree = 0 if splats is None else self.splats.sh_degree
         self.history: list[Json] = []
         self.stopwatch = Stopwatch()
         self.loss_terms: dict[str, LossTerm] = {"photometric": partial(_photometric_term, self)}
@@ -421,19 +422,22 @@ class SplatModule(LightningModule):
         """Restore history and schedule; a fit keeps its own schedule.
 
         Raises:
-            ValueError: A fit cannot continue from the checkpoint, or it is of another scene than the trainer's, which
-                ``allow_other_scene`` of :class:`nsvq_lightning.training.trainer.SplatTrainer` lets pass.
+            ValueError: The checkpoint is of other codebooks or another SH degree; a fit cannot continue from it; or it
+                is of another scene than the trainer's, which ``allow_other_scene`` of
+                :class:`nsvq_lightning.training.trainer.SplatTrainer` lets pass.
         """
         scene = run_scene.scene_of(self._trainer)
         if scene is not None and resume.SCENE in checkpoint and not getattr(self._trainer, "allow_other_scene", False):
             resume.check_scene(checkpoint, scene)
         self.history = list(checkpoint["history"])
+        settings = {"background": self.background, "antialiased": self.antialiased}
         if self._trainer is None or self._trainer.state.fn != "fit":
             self.cameras = np.reshape(checkpoint.get("cameras", []), (-1, 4))
             self.schedule = Schedule(**checkpoint["schedule"])
-            return
-        self.schedule = resume.continued_schedule(checkpoint, self.schedule)
-        if changed := resume.changes(checkpoint, self.schedule, {**self.hparams, "background": self.background}):
+        else:
+            self.schedule = resume.continued_schedule(checkpoint, self.schedule)
+            settings = {**self.hparams, **settings}
+        if changed := resume.changes(checkpoint, self.schedule, settings):
             log.warning("the checkpoint is of a run with other settings: pass %s to continue it as it was", changed)
         resume.check_continuation(checkpoint, self.state_dict(), self.quantizer_settings)
 

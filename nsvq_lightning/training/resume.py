@@ -32,7 +32,16 @@ WAY_OUT = "pass a checkpoint that nsvq fit has written, …/checkpoints/last.ckp
 
 
 def continued_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> Schedule:
-    """The schedule with the iterations that the checkpoint's run has saved in the same warm-up phase."""
+    """The schedule with the iterations that the checkpoint's run has saved in the same warm-up phase.
+
+    Raises:
+        ValueError: The checkpoint holds only weights.
+    """
+    if not checkpoint.get("optimizer_states"):
+        raise ValueError(
+            "the checkpoint holds weights without the state of the optimiser, so training cannot continue from it; "
+            "export its scene and start from that (--model.init_from=scene.ply)"
+        )
     stored = Schedule(**checkpoint["schedule"])
     same = all(getattr(stored, name) == getattr(schedule, name) for name in ("total", "reference_total", "warmup_end"))
     return replace(schedule, saved=stored.saved) if same else schedule
@@ -54,7 +63,7 @@ def changes(checkpoint: Mapping[str, Any], schedule: Schedule, own: Mapping[str,
 def check_continuation(
     checkpoint: Mapping[str, Any], own: Mapping[str, Tensor], quantizers: Mapping[str, Mapping[str, Any]]
 ) -> None:
-    """Check that training of a module can continue from a checkpoint.
+    """Check that a module can have the splats and codebooks of a checkpoint.
 
     Args:
         checkpoint: The checkpoint, as it was read.
@@ -62,13 +71,8 @@ def check_continuation(
         quantizers: Class and number of codes of the module's quantizers by attribute, as requested.
 
     Raises:
-        ValueError: It holds only weights, or is of a module with other settings.
+        ValueError: It is of a module with other settings.
     """
-    if not checkpoint.get("optimizer_states"):
-        raise ValueError(
-            "the checkpoint holds weights without the state of the optimiser, so training cannot continue from it; "
-            "export its scene and start from that (--model.init_from=scene.ply)"
-        )
     stored, here = (sh_degree_of(values["splats.shN"]) for values in (checkpoint["state_dict"], own))
     if stored != here:
         raise ValueError(f"the checkpoint has SH degree {stored}, this run {here}; pass --model.sh_degree={stored}")

@@ -86,6 +86,6 @@ class SplatTrainer(Trainer):
         path = Path(output)
         make_folder_of(path)
         scene = model.compressed()
-        save(scene, path, model.storage)
-        log.info("wrote %s: %d splats, %d bytes", path, len(scene), path.stat().st_size)
+        size = save(scene, path, model.storage)
+        log.info("wrote %s: %d splats, %d bytes", path, len(scene), size)
         return path

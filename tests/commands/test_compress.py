@@ -43,6 +43,9 @@ def test_a_file_is_compressed_and_again_to_the_same_bytes(tmp_path: Path, capsys
     assert output.read_bytes() == first
     assert main(["compress", str(output), str(tmp_path / "again.nsvq"), "--codebooks=none", "--level=paper"]) == 0
     assert read_header(tmp_path / "again.nsvq").level == "paper"
+    capsys.readouterr()
+    assert main(["compress", str(output), str(output), "--codebooks=none", "--level=paper"]) == 0  # in its place
+    assert f", {len(first) / output.stat().st_size:.1f} times smaller than scene.nsvq" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("splats", "left"), [("25%", 100), ("150", 150), ("1", 1), ("100%", 400), ("9000", 400)])

@@ -124,6 +124,7 @@ def test_measuring_says_how_the_pictures_differ(tmp_path: Path, capsys: pytest.C
         ("a.nsvq b.ply --up z", "--up needs to know where up is now: add --data.root or --up-from", 2),
         ("a.nsvq b.ply --up-from 0 0 1", "--up-from says where up is: add --up", 2),
         ("a.nsvq b.ply --floaters", "--floaters asks the photos: add --data.root", 2),
+        ("a.nsvq a.nsvq --measure", "the input, which would be overwritten: name another output", 2),
         ("a.nsvq b.ply --crop 1 1 1 2 2 2 --measure", "--measure compares with the input as it is", 2),
         ("a.nsvq a.nsvq b.ply --measure", "--measure compares with the input as it is", 2),
         ("a.nsvq b.ply --align x", "--align moves the cameras of a scene folder: add --data.root", 2),

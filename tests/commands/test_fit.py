@@ -199,6 +199,8 @@ def test_only_the_command_line_names_what_is_imported(
     )
     checkpoint = torch.load(finished / "checkpoints" / "last.ckpt", weights_only=True)
     checkpoint["hyper_parameters"]["quantizer"]["class_path"] = "elsewhere.Mine"
+    for settings in checkpoint["quantizer_settings"].values():
+        settings["quantizer"] = "Mine"
     torch.save(checkpoint, tmp_path / "last.ckpt")
     for command in (["export"], ["predict", "--data.root=."]):
         assert main([*command, "--ckpt_path=last.ckpt"]) == 1
@@ -209,7 +211,9 @@ def test_only_the_command_line_names_what_is_imported(
     assert read_nsvq(tmp_path / "scene.nsvq").config["quantizers"]["sh0"] == "Mine"
 
 
-def test_export_reads_no_scene_and_its_options_win_over_the_checkpoint(finished: Path, tmp_path: Path) -> None:
+def test_export_reads_no_scene_and_its_options_win_over_the_checkpoint(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
     arguments = ["export", f"--ckpt_path={finished / 'checkpoints' / 'last.ckpt'}"]
     for name, more in (("out.nsvq", []), ("out.ply", []), ("paper.nsvq", ["--model.storage.level", "paper"])):
         assert main([*arguments, f"--output={tmp_path / name}", *more]) == 0
@@ -218,6 +222,14 @@ def test_export_reads_no_scene_and_its_options_win_over_the_checkpoint(finished:
     compact, paper = (read_nsvq(tmp_path / name) for name in ("out.nsvq", "paper.nsvq"))
     assert len(paper.codebooks["scales"]) == 16  # of the checkpoint
     assert len(paper) == len(compact)
+    capsys.readouterr()
+    assert main([*arguments, f"--output={tmp_path / 'x.nsvq'}", "--model.codebooks=0.5k"]) == 1
+    assert "the checkpoint is of a run that quantizes with " in capsys.readouterr().err
+    assert main([*arguments, f"--output={tmp_path / 'x.nsvq'}", "--model.antialiased=true"]) == 0
+    assert "of a run with other settings: pass --model.antialiased=False to" in caplog.text
+    assert main([*arguments, f"--output={tmp_path / 'www/lod-meta.json'}"]) == 0
+    size = sum(path.stat().st_size for path in (tmp_path / "www").rglob("*") if path.is_file())
+    assert f"{size} bytes" in caplog.text
     assert (tmp_path / "out.nsvq").stat().st_size < (tmp_path / "paper.nsvq").stat().st_size
 
 

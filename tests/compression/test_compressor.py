@@ -222,6 +222,11 @@ def test_a_scene_of_another_program_is_compressed() -> None:
     assert len(taught) == 200
     with pytest.raises(ValueError, match=r"expected a photo \[H, W, 3\] of its size for each of 8 cameras"):
         nl.compress(splats, cameras, photos[:7])
+    for wrong, kind in ((photos, "float32 of up to 2"), ([photo.long() for photo in photos], "int64 of up to")):
+        with pytest.raises(ValueError, match=f"photo 0 is torch.{kind}.*: photos must be uint8, or float in"):
+            nl.compress(splats, cameras, wrong)
+    with pytest.raises(ValueError, match=r"photo 0 is torch\.float32 of up to nan"):
+        nl.compress(splats, cameras, [photo * torch.nan for photo in photos])
     with pytest.raises(ValueError, match="give target_bytes or max_error, not both"):
         nl.compress(splats, target_bytes=9999, max_error=0.01)
     arrays = nl.compress(splats, cameras, np.stack([photo.numpy() for photo in photos]) / 255, left=200, steps=8)

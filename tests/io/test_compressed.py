@@ -44,6 +44,15 @@ def test_joined_scenes_have_the_cameras_of_all() -> None:
     assert coded(20).sampling() is None
 
 
+def test_cameras_of_some_scenes_are_not_those_of_all(caplog: pytest.LogCaptureFixture) -> None:
+    far = plain_scene(5, 1)
+    near = replace(far, cameras=np.array([[0.0, 1.0, 2.0, 500.0]]))
+    assert len(CompressedScene.joined([far, far]).cameras) == 0
+    assert not caplog.text
+    assert len(CompressedScene.joined([near, far]).cameras) == 0
+    assert "of some scenes the cameras of their training are known, of some not" in caplog.text
+
+
 @pytest.mark.parametrize("cameras", [np.ones((65, 4)), np.ones((2, 3)), np.zeros((1, 4)), np.full((1, 4), np.inf)])
 def test_cameras_that_no_reader_takes_are_refused(cameras: NDArray[np.float64]) -> None:
     with pytest.raises(ValueError, match="cameras must be at most 64 finite positions"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ from lightning.pytorch import Trainer
 from torch import Tensor, nn
 
 from nsvq_lightning.callbacks import PhaseSchedule
+from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quantize import NSVQ
@@ -20,6 +22,7 @@ from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, Splats
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
+from nsvq_lightning.training.trainer import SplatTrainer
 
 CODES = {"scales": 6, "quats": 5, "sh0": 4, "shN": 3}
 
@@ -208,6 +211,16 @@ def test_a_trained_module_cannot_be_trained_from_the_start(module: SplatModule) 
     module.trainer.optimizers = [module.configure_optimizers()]  # type: ignore[list-item]
     with pytest.raises(ValueError, match="already trained into its finetune phase"):
         PhaseSchedule().on_train_start(module.trainer, module)
+
+
+def test_given_splats_stay_as_they_are(demo_scene: Path) -> None:
+    splats = make_splats()
+    before = [tensor.detach().clone() for tensor in splats.raw()]
+    module = SplatModule(sh_degree=1, codebooks=None, splats=splats)
+    trainer = SplatTrainer(max_steps=4, callbacks=[], enable_checkpointing=False, enable_progress_bar=False)
+    trainer.fit(module, ColmapDataModule(demo_scene))
+    assert all(torch.equal(one, other) for one, other in zip(splats.raw(), before, strict=True))
+    assert not torch.equal(module.splats.means, splats.means)
 
 
 def test_trained_splats_are_rendered_with_all_their_coefficients() -> None:
