@@ -112,8 +112,7 @@ def own_scene(
         raise ValueError(f"expected a photo [H, W, 3] of its size for each of {len(cameras)} cameras")
     for number, photo in enumerate(photos):
         if photo.dtype != torch.uint8 and not (photo.is_floating_point() and photo.max() < 2):
-            text = f"photo {number} is {photo.dtype} of up to {photo.max():g}"
-            raise ValueError(f"{text}: photos must be uint8, or float in [0, 1]")
+            raise ValueError(f"photo {number} is {photo.dtype} of up to {photo.max():g}, not uint8 or float in [0, 1]")
     split = "1 in 8" if photos else OWN
     bytes_ = [
         (255 * eight_bit(photo.cpu())).round().to(torch.uint8) for photo in photos or pictures(splats, cameras, look)

@@ -320,22 +320,17 @@ def _scaled(lens: Pinhole, divisor: int, max_width: int | None) -> Pinhole:
 
 
 def load_cameras(
-    root: str | Path,
-    factor: Factor | None = None,
-    max_width: int | None = 1600,
-    model: str | None = None,
-    origin: Place = ZERO,
-    **rest: Any,
+    root: str | Path, factor: Factor | None = None, max_width: int | None = 1600, model: str | None = None, **rest: Any
 ) -> dict[str, Camera]:
     """Cameras of a scene folder by the names of its photos, which need not be there; those of :func:`load_scene`.
 
-    Options are those of that function, too; the others make no difference.
+    Options are those of that function, ``origin``, too; the others make no difference.
 
     Raises:
         SceneError: There is no model, or it is damaged; or it does not say how large the photos are.
     """
     root = Path(root)
-    poses, frame = _framed(read_poses(root, model, allow_outside=True), root, origin)
+    poses, frame = _framed(read_poses(root, model, allow_outside=True), root, rest.get("origin", ZERO))
     lenses = {}
     for number, lens in poses.cameras.items():
         full, _ = rectify(lens, lens.width, lens.height, keep_maps=False)
