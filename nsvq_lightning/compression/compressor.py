@@ -31,7 +31,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.sampling import trained_by
 from nsvq_lightning.report.numbers import evaluate
 from nsvq_lightning.splats import attributes
-from nsvq_lightning.splats.splats import Splats, SplatTensors
+from nsvq_lightning.splats.splats import SplatTensors
 from nsvq_lightning.training import importance
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
@@ -354,7 +354,7 @@ class Compressor:
         steps = max(4, self.steps or self.usual_steps(setting.splats))
         prune = steps // 4 if setting.splats < len(self.scene) else 0
         module = SplatModule(
-            splats=Splats.from_tensors(*self._splats),
+            splats=self._splats,
             codebooks=sizes or None,
             # A trained scene is in its place; what is left of some splats moves into that of the others.
             rates=LearningRates(means=4e-5 if prune else LearningRates.means_final),

@@ -120,7 +120,7 @@ class SplatModule(LightningModule):
         seed: int = 0,
         storage: Storage = Storage(),  # noqa: B008  frozen
         init_from: str | None = None,
-        splats: Splats | None = None,
+        splats: SplatTensors | None = None,
     ) -> None:
         super().__init__()
         if background not in ("auto", "black", "white", "random"):

@@ -210,8 +210,6 @@ def check_scene(checkpoint: Mapping[str, Any], scene: Scene) -> None:
         ValueError: It is of another one.
     """
     stored, own = checkpoint[SCENE], scene_record(scene)
-    if stored["views"].keys() != own["views"].keys():
-        log.warning("%s has other photos than it was trained on: some of these may be test views now", scene.root)
     common = stored["views"].keys() & own["views"].keys()
     same = sum(stored["views"][name] == own["views"][name] for name in common)
     if not common or 2 * same < len(common):  # not all: rounding may turn out otherwise
@@ -220,6 +218,8 @@ def check_scene(checkpoint: Mapping[str, Any], scene: Scene) -> None:
             f"views, and {same} of the {len(scene)} views of {scene.root} are among them with the same pose; pass "
             "--data.root with the folder it was trained on, or --trainer.allow_other_scene=true if that is meant"
         )
+    if stored["views"].keys() != own["views"].keys():
+        log.warning("%s has other photos than it was trained on: some of these may be test views now", scene.root)
 
 
 class PlainCheckpointIO(TorchCheckpointIO):
