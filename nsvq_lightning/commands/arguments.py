@@ -202,7 +202,7 @@ def known_views(path: Path, root: Path | None, scene: "CompressedScene | None" =
         SceneError: The folder is not a scene.
         ValueError: What the run has recorded is damaged.
     """
-    from nsvq_lightning.compression.viewpoints import check_cameras
+    from nsvq_lightning.data.scene import check_cameras
 
     cameras, photos = _found_views(path, root, scene.origin if scene else (0, 0, 0))
     if not (scene and cameras):

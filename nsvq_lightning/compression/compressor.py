@@ -21,7 +21,7 @@ from nsvq_lightning.compression.basis import components
 from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.datamodule import SceneDataModule
-from nsvq_lightning.data.scene import Scene, spread
+from nsvq_lightning.data.scene import Scene, check_cameras, spread
 from nsvq_lightning.io.compressed import CompressedScene, on_white, renderer
 from nsvq_lightning.io.morton import spatial_order
 from nsvq_lightning.io.nsvq.file import decode, encode
@@ -484,7 +484,7 @@ def compress(
     elif background != "black":
         raise ValueError(f"background must be black or white, got {background!r}")
     if cameras:
-        viewpoints.check_cameras(cameras, scene.means)
+        check_cameras(cameras, scene.means)
         scene = replace(scene, cameras=trained_by(cameras))
     shown = [torch.as_tensor(photo) for photo in photos]
     views = viewpoints.own_scene(scene.tensors(), cameras, photos=shown) if shown else None

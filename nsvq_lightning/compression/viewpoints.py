@@ -10,8 +10,7 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid, normalize
 
 from nsvq_lightning.data.images import ImageStore, Picture
-from nsvq_lightning.data.points import in_picture
-from nsvq_lightning.data.scene import Scene, spread
+from nsvq_lightning.data.scene import SOME_SPLATS, Scene, seen_by, spread
 from nsvq_lightning.io.morton import spatial_order
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.rendering.camera import Camera, camera_of
@@ -20,14 +19,12 @@ from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
 from nsvq_lightning.rendering.poses import poses, view_towards
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.rendering.sh import sh_basis
-from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s
+from nsvq_lightning.splats.conventions import Float32s, Float64s
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached, sh_degree_of
 from nsvq_lightning.training.importance import Renderer
 
 # Near plane of a guessed camera, as a share of the distance to what it looks at.
 NEARNESS = 0.02
-# So many splats are asked what cameras show, at most.
-SOME_SPLATS = 20_000
 
 
 def look_at(target: Float64s, eye: Float64s, width: int, height: int, angle: float) -> Camera:
@@ -137,43 +134,13 @@ def own_scene(
     )
 
 
-# Share of a scene's splats that its cameras show at least. On six scenes, their own cameras show 99 %; with y and z
-# turned round or exchanged, 43 % at most.
-MIN_SHOWN = 0.8
-# So many cameras are asked, at most.
-SOME_CAMERAS = 300
-
-
-def check_cameras(cameras: Sequence[Camera], means: Float32s) -> None:
-    """Check that cameras show a scene: its splats, and each some of them.
-
-    Args:
-        cameras: At least one.
-        means: Positions ``[N, 3]``, N > 0.
-
-    Raises:
-        ValueError: They are of another scene, or in other coordinates.
-    """
-    seen = _seen(means, spread(cameras, SOME_CAMERAS))
-    shown = min(seen.any(0).mean(), (seen.mean(1) > 1e-3).mean())
-    if shown < MIN_SHOWN:
-        others = "they are of another scene, or in other coordinates (x right, y down, z forward)"
-        raise ValueError(f"{len(cameras)} cameras show {shown:.0%} of the scene's splats: {others}")
-
-
-def _seen(means: Float32s, cameras: Sequence[Camera]) -> Bools:
-    """Which of some of the positions are in the picture of which camera ``[C, P]``."""
-    places = spread(means, SOME_SPLATS).astype(np.float64)
-    return np.stack([in_picture(places, camera) for camera in cameras])
-
-
 # Share of the splats of a part of a scene that one of its views has in the picture at least.
 MIN_OF_PART = 0.1
 
 
 def showing(cameras: Sequence[Camera], means: Float32s, most: int) -> list[Camera]:
     """At most so many cameras that show most of the positions ``[N, 3]``, N > 0; those that show few are no use."""
-    shares = _seen(means, cameras).mean(1) if cameras else np.zeros(0)
+    shares = seen_by(cameras, means).mean(1) if cameras else np.zeros(0)
     best = np.argsort(-shares, kind="stable")[:most]
     return [cameras[index] for index in best if shares[index] >= MIN_OF_PART]
 

@@ -277,6 +277,7 @@ class SplatModule(LightningModule):
                 make = partial(run_scene.splats_of_file, self.init_from, self.frame, degree)
                 self.active_sh_degree = degree
             self.splats = distributed.on_first_process(self.trainer, make).to(self.device)
+        run_scene.warn_of_others(self.trainer, self.splats.means)
         return optim.build_adam(optim.param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
 
     def on_train_start(self) -> None:

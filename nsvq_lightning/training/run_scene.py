@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.dense_start import dense_points, far_points
-from nsvq_lightning.data.scene import ONE_PLACE, Scene, View, spread
+from nsvq_lightning.data.scene import ONE_PLACE, Scene, View, check_cameras, spread
 from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.frame import EXTENT, Frame
@@ -110,6 +110,17 @@ def splats_of_file(path: str, frame: Frame, sh_degree: int) -> Splats:
         degree = scene.sh_degree
         raise ValueError(f"{path} has SH degree {degree}, the module {sh_degree}; set sh_degree={degree}")
     return Splats.from_tensors(*frame.splats(scene.decode()))
+
+
+def warn_of_others(trainer: Trainer, means: Tensor) -> None:
+    """Warn where the trainer's photos do not show the splats ``[N, 3]`` that it starts from, in its frame."""
+    scene = scene_of(trainer)
+    if scene is None or not trainer.is_global_zero:
+        return
+    try:
+        check_cameras(scene.standard.train_cameras, means.numpy(force=True))
+    except ValueError as error:
+        log.warning("the splats to start from do not fit the photos of %s: its %s", scene.root, error)
 
 
 def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int) -> Splats:

@@ -82,7 +82,7 @@ def test_photos_from_one_place_are_named(make_scene: Callable[..., Path]) -> Non
         trainer.fit(module, data)
 
 
-def test_a_run_can_start_from_a_file(demo_scene: Path, tmp_path: Path) -> None:
+def test_a_run_can_start_from_a_file(demo_scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     start = Splats.from_tensors(*random_splats(30, sh_degree=1))
     save(start, tmp_path / "start.ply")
     module = SplatModule(
@@ -96,6 +96,13 @@ def test_a_run_can_start_from_a_file(demo_scene: Path, tmp_path: Path) -> None:
     means = torch.from_numpy(module.compressed().means)
     torch.testing.assert_close(means, start.means.detach(), atol=1e-5, rtol=0)
     assert module.active_sh_degree == 1
+    caplog.clear()
+    fit(SplatModule(sh_degree=1, codebooks=None, splats=start), data, [PhaseSchedule()], 1)
+    assert "do not fit" not in caplog.text
+    start.means.data.mul_(30)
+    fit(SplatModule(sh_degree=1, codebooks=None, splats=start), data, [PhaseSchedule()], 1)
+    assert f"do not fit the photos of {demo_scene}: its" in caplog.text
+    assert "they are of another scene, or in other coordinates" in caplog.text
     wrong = SplatModule(sh_degree=2, codebooks=None, init_from=str(tmp_path / "start.ply"))
     with pytest.raises(ValueError, match="set sh_degree=1"):
         fit(wrong, data, [PhaseSchedule()], 1)
