@@ -90,16 +90,13 @@ class ExposureCompensation(SplatCallback):
 
     def on_train_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Say how much the photos differ."""
-        self._leave(module)
+        self.on_exception(trainer, module)
         gains = 1 + self._changes.detach()[:, :, :3].diagonal(dim1=1, dim2=2).mean(1)
         stops = gains.log2() - gains.log2().mean()
         log.info(f"exposures of the train photos: {stops.min():+.2f} to {stops.max():+.2f} stops")
 
-    def on_exception(self, trainer: Trainer, module: SplatModule, exception: BaseException) -> None:
+    def on_exception(self, trainer: Trainer, module: SplatModule, *_: Any) -> None:
         """Leave the module as it was."""
-        self._leave(module)
-
-    def _leave(self, module: SplatModule) -> None:
         if self._plain is not None:
             module.loss_terms["photometric"] = self._plain
             self._plain = None

@@ -65,7 +65,8 @@ class ExportScene(WritingCallback):
             page = folder / "viewer.html"
             title = page.resolve().parent.parent.name
             with optional(page):
-                size = viewer.write_viewer(page, folder / "scene.nsvq", viewer.some_cameras(photos), title)
+                cameras = dict(zip(photos.names, photos.cameras, strict=True))
+                size = viewer.write_viewer(page, folder / "scene.nsvq", cameras, title)
                 log.info("wrote %s (%d bytes)", page, size)
 
 
@@ -148,12 +149,10 @@ class LiveScene(WritingCallback):
         self._answered, ended = asked, time.monotonic()
         self._next = ended + (ended - began) / SHARE
 
-    def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
-        """Leave the finished scene alone."""
+    def on_fit_end(self, trainer: Trainer, module: SplatModule, *_: Any) -> None:
+        """Leave the finished scene alone, and nothing behind that only a running fit has."""
         if self._running and trainer.is_global_zero:
             viewer.end_live(run_folder(trainer))
         self._running = False
 
-    def on_exception(self, trainer: Trainer, module: SplatModule, exception: BaseException) -> None:
-        """Leave nothing behind that only a running fit has."""
-        self.on_fit_end(trainer, module)
+    on_exception = on_fit_end

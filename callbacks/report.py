@@ -109,18 +109,6 @@ class MetricReport(WritingCallback):
         if self.is_due(module, trainer.global_step):
             self._evaluate_once(trainer, module)
 
-    def on_train_epoch_end(self, trainer: Trainer, module: SplatModule) -> None:
-        """Evaluate the end of the run, before Lightning's own work at the end of its only epoch."""
-        self._evaluate_once(trainer, module)
-
-    def on_train_end(self, trainer: Trainer, module: SplatModule) -> None:
-        """Evaluate the end of the run if no epoch has ended."""
-        self._evaluate_once(trainer, module)
-
-    def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
-        """Catch up for a run that was stopped after its last iteration: when continued, it trains no further."""
-        self._evaluate_once(trainer, module)
-
     def _evaluate_once(self, trainer: Trainer, module: SplatModule) -> None:
         """Evaluate an iteration that was not evaluated yet, and notify the callbacks that monitor it."""
         iteration = trainer.global_step
@@ -133,6 +121,10 @@ class MetricReport(WritingCallback):
         with module.stopwatch.paused(module.device), self._beside.timed("evaluations"):
             self._evaluate(trainer, module, iteration, datamodule.test_dataloader())
             notify_monitors(trainer, module)
+
+    # The end of the run: before Lightning's own work at the end of its only epoch; where no epoch has ended; and of one
+    # that was stopped after its last iteration, and trains no further when it is continued.
+    on_train_epoch_end = on_train_end = on_fit_end = _evaluate_once
 
     @torch.no_grad()
     def _evaluate(self, trainer: Trainer, module: SplatModule, iteration: int, views: Any) -> None:

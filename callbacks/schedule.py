@@ -174,9 +174,7 @@ class PhaseSchedule(SplatCallback):
             "PhaseSchedule.total (--callbacks.phases.total) and a larger trainer.max_steps to continue its last phase"
         )
 
-    def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
-        """Check that, too, where no iteration was left to train, before files are written."""
-        self.on_train_start(trainer, module)
+    on_fit_end = on_train_start  # also where no iteration was left to train, before files are written
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
         """Write the phase of the iteration that starts; end the run earlier by what its warm-up has saved."""

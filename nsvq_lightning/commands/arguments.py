@@ -263,8 +263,9 @@ def scene_with_views(
             raise
         log.warning("%s: the cameras of its training cannot be read (%s)", path, error)
     if cameras and not len(scene.cameras):
-        log.info("%s: blur and size are those of %d cameras that it was trained by", path, len(cameras))
-        scene = replace(scene, cameras=trained_by(cameras))
+        trained = photos.train_cameras if photos else cameras
+        log.info("%s: blur and size are those of %d cameras that it was trained by", path, len(trained))
+        scene = replace(scene, cameras=trained_by(trained))
     if photos and photos.white:
         scene = on_white(scene)
     return scene, cameras, photos

@@ -118,6 +118,8 @@ def _contradiction(options: argparse.Namespace) -> str:
         return "--measure compares with the input as it is: convert without it first"
     if options.measure and options.output.exists() and options.output.samefile(options.inputs[0]):
         return "--measure compares with the input, which would be overwritten: name another output"
+    if options.splats and len(options.inputs) > 1:
+        return "--splats asks the pictures of one scene: thin each scene before they are joined"
     for name, suffixes in WRITER_OPTIONS.items():
         if getattr(options, name) is not None and formats.suffix_of(options.output) not in suffixes:
             flag = name.replace("_", "-")

@@ -154,8 +154,10 @@ def plan(options: argparse.Namespace) -> list[Run]:
         for scene, quantizer, size, seed in product(options.scenes, quantizers, sizes, options.seeds):
             # Absolute, so that the same sweep started from another folder finds its runs.
             root = Path(scene or default["data"]["init_args"].get("root", "")).resolve()
+            start = default["model"]["init_from"]
             chosen = {
                 "data.root": root,
+                "model.init_from": start and Path(start).expanduser().absolute(),
                 "model.quantizer": quantizer,
                 "model.codebooks": size,
                 "model.seed": seed,

@@ -36,15 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--live", action="store_true", help="follow a fit that is running, given its folder")
     add_root(parser, "folder of the photos, whose cameras are offered; that of the run by default")
     add("-o", "--output", type=Path, metavar="OUT.html", help="write one page with the scene instead")
-    add("--port", type=_port, default=7007, help="%(default)s by default; 0 for any that is free")
+    add("--port", type=int, default=7007, help="%(default)s by default; 0 for any that is free")
     add("--host", default="127.0.0.1", help="127.0.0.1, this machine only, by default; 0.0.0.0 for all of the network")
     add("--no-open", dest="open", action="store_false", help="do not open the browser")
-
-
-def _port(text: str) -> int:
-    if not (text.isdecimal() and int(text) < 1 << 16):
-        raise argparse.ArgumentTypeError(f"must be from 0 to 65535, got {text}")
-    return int(text)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -77,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
         handler = type("Handler", (_Handler,), settings)
         try:
             server = _Server((options.host, options.port), handler)
-        except OSError as error:
+        except (OSError, OverflowError) as error:
             raise OSError(f"cannot listen on {options.host}:{options.port} ({error}); choose another --port") from None
         with server:
             address = f"http://{options.host}:{server.server_port}/"
@@ -107,16 +101,14 @@ def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
 def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     """Cameras of the photos, or guessed ones."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
-    from nsvq_lightning.data.scene import spread
     from nsvq_lightning.io.formats import read_scene
-    from nsvq_lightning.report.viewer import MAX_CAMERAS
 
     # What a run has recorded are its own, and need no look at the scene.
     is_own = options.root is None and (options.scene / "viewer.html").is_file()
     scene = None if options.live or is_own else read_scene(file)
     cameras, _ = known_views(options.scene, options.root, scene)
     if cameras:
-        return dict(spread(list(cameras.items()), MAX_CAMERAS))
+        return cameras
     if options.live:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
     sys.stderr.write("no photos: cameras are guessed from the scene; --data.root names the folder of the photos\n")

@@ -250,6 +250,7 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
         raise SceneError(f"{files['images']} lists no registered image: run COLMAP's mapper again")
     viewmats = _viewmats(rows, files["images"])
     for row in rows:
+        check_name(row.name, files["images"], allow_outside=True)
         if row.camera_id not in cameras:
             raise SceneError(
                 f"{files['images']}: photo {row.name} is of camera {row.camera_id}, which {files['cameras'].name} does "

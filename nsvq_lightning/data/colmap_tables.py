@@ -92,15 +92,9 @@ def read_images(path: Path) -> list[ImageRow]:
     """The images in ``images.bin`` or ``images.txt``.
 
     Raises:
-        ValueError: The file is damaged, or a name is not UTF-8.
+        ValueError: The file is damaged.
     """
-    images = list(_records(path, _image_record) if path.suffix.lower() == ".bin" else _image_lines(path))
-    for image in images:
-        try:
-            image.name.encode()
-        except UnicodeEncodeError:
-            raise ValueError(f"the name of a photo is not UTF-8, {image.name!r}: rename it and run COLMAP") from None
-    return images
+    return list(_records(path, _image_record) if path.suffix.lower() == ".bin" else _image_lines(path))
 
 
 def read_points(path: Path, tracks: bool = False) -> PointTable:

@@ -122,7 +122,10 @@ def _decoded(path: Path, flags: int) -> Arrays:
             # OpenCV applies the orientation to TIFFs even when told not to.
             applied = int(head.getexif().get(Base.Orientation, 1)) if head.format == "TIFF" else 1
             _check_whole(data)
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+            if head.format == "TIFF" and head.mode == "RGBA" and flags == cv2.IMREAD_UNCHANGED:
+                image = cv2.cvtColor(np.asarray(head), cv2.COLOR_RGBA2BGRA)  # OpenCV would multiply colours by alpha
+            else:
+                image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             raise OSError("OpenCV cannot decode it")
     except (*DAMAGED, cv2.error) as error:

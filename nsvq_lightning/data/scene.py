@@ -34,6 +34,9 @@ T = TypeVar("T")
 
 Factor = Literal[1, 2, 4, 8]
 
+# So many cameras, and so many splats, are asked what cameras show, at most.
+SOME_CAMERAS, SOME_SPLATS = 300, 20_000
+
 
 def spread(rows: T, most: int) -> T:
     """At most so many of the rows of a list, an array or a tensor, evenly spread."""
@@ -43,8 +46,6 @@ def spread(rows: T, most: int) -> T:
 # Share of a scene's splats that its cameras show at least. On six scenes, their own cameras show 99 %; with y and z
 # turned round or exchanged, 43 % at most.
 MIN_SHOWN = 0.8
-# So many cameras, and so many splats, are asked, at most.
-SOME_CAMERAS, SOME_SPLATS = 300, 20_000
 
 
 def check_cameras(cameras: Sequence[Camera], means: Float32s) -> None:

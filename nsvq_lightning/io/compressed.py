@@ -190,6 +190,9 @@ class CompressedScene:
                 codebooks[name] = np.concatenate(books)
             else:
                 raw[name] = np.concatenate([scene.rows(name) for scene in scenes])
+        config = dict(first.config)
+        if any(scene.config.get("precision") != config.get("precision") for scene in scenes):
+            config.pop("precision", None)  # that of one is too coarse for another
         scenes = [scene.relative_to(first.origin) for scene in scenes]
         cameras = [scene.cameras for scene in scenes]
         if not all(map(len, cameras)):
@@ -203,7 +206,7 @@ class CompressedScene:
             codebooks,
             raw,
             sh_degree=degree,
-            config=first.config,
+            config=config,
             origin=first.origin,
             cameras=fewer_cameras(np.concatenate(cameras)),
         )

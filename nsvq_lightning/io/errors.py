@@ -63,12 +63,16 @@ def json_object(text: bytes, name: str) -> Json:
         FormatError: It holds something else.
     """
     try:
-        found = json.loads(text)
+        found = json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
         raise FormatError(f"damaged: {name} is not JSON ({error})") from None
     if not isinstance(found, dict):
         raise FormatError(f"damaged: {name} is not a JSON object")
     return found
+
+
+def _no_number(name: str) -> None:
+    raise ValueError(f"it holds {name}, which JSON does not have")
 
 
 # Splats that any file may hold, however short, such as one of equal splats; beyond, each takes two bytes or more. A

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numba import uint64
 
 from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import INT64, UINT64, check_array, check_inside
@@ -90,8 +89,14 @@ def morton_keys(cells: Int64s, depths: Int64s) -> Uint64s:
     """
     check_array("cells", cells, (len(depths), 3), INT64)
     check_depths(depths, AXIS_BITS)
-    keys = np.empty(len(cells), np.uint64)
-    _interleave(cells, depths, keys)
+    shift = AXIS_BITS - depths
+    keys = np.zeros(len(cells), np.uint64)
+    for axis in range(3):
+        # Two zeros between adjacent bits of the 21.
+        bits = (cells[:, axis] >> shift << shift).astype(np.uint64)
+        for mask, gap in zip(_MASKS[-2::-1], _SHIFTS[::-1], strict=True):
+            bits = (bits | bits << gap) & mask
+        keys |= bits << np.uint64(2 - axis)
     return keys
 
 
@@ -110,32 +115,12 @@ def unmorton(keys: Uint64s) -> Int64s:
     """
     check_array("keys", keys, (len(keys),), UINT64)
     cells = np.empty((len(keys), 3), np.int64)
-    _separate(keys, cells)
+    for axis in range(3):
+        bits = keys >> np.uint64(2 - axis) & _MASKS[0]
+        for mask, gap in zip(_MASKS[1:], _SHIFTS, strict=True):
+            bits = (bits | bits >> gap) & mask
+        cells[:, axis] = bits
     return cells
-
-
-@kernel
-def _interleave(cells, depths, keys):  # type: ignore[no-untyped-def]
-    for i in range(len(keys)):
-        shift = AXIS_BITS - depths[i]
-        key = uint64(0)
-        for axis in range(3):
-            # Two zeros between adjacent bits of the 21.
-            bits = uint64(cells[i, axis] >> shift << shift)
-            for step in range(4, -1, -1):
-                bits = (bits | (bits << _SHIFTS[step])) & _MASKS[step]
-            key |= bits << uint64(2 - axis)
-        keys[i] = key
-
-
-@kernel
-def _separate(keys, cells):  # type: ignore[no-untyped-def]
-    for i in range(len(keys)):
-        for axis in range(3):
-            bits = (keys[i] >> uint64(2 - axis)) & _MASKS[0]
-            for step in range(5):
-                bits = (bits | (bits >> _SHIFTS[step])) & _MASKS[step + 1]
-            cells[i, axis] = bits
 
 
 def nearest_before(cells: Int64s) -> Int32s:

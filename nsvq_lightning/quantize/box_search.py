@@ -18,7 +18,17 @@ import numpy as np
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
-from nsvq_lightning.compute.memory import FLOAT32, INT32, INT64, Array, aligned_empty, check_array, check_table, outside
+from nsvq_lightning.compute.memory import (
+    FLOAT32,
+    INT32,
+    INT64,
+    Array,
+    aligned_empty,
+    check_array,
+    check_inside,
+    check_table,
+    outside,
+)
 from nsvq_lightning.compute.rows import count_outside
 
 # Factor on the bounds, far above the relative rounding error of a float32 distance.
@@ -340,8 +350,7 @@ def box_search(
     check_array("memory[0]", last, (remembered,), INT32)
     check_array("memory[1]", anchors, (remembered, dim), FLOAT32)
     check_array("memory[2]", clearance, (remembered,), np.dtype(np.float64))
-    if order.min() < 0 or order.max() >= num_codes:
-        raise outside("order", order, num_codes)
+    check_inside("order", order, num_codes)
     result = np.empty(len(rows), np.int64)
     thread_count()
     blocks, tree = -(-len(rows) // _ROWS), _boxes(codebook, order)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.distributed
+from scipy.stats import entropy
 from torch import Tensor
 
 from nsvq_lightning.data.scene import View
@@ -115,10 +116,8 @@ def write_metrics(path: Path, metrics: Values) -> None:
 
 def _codes_in_use(codes: Integers, size: int) -> Json:
     """Rows of the codebook, how many of them are used, and the entropy of the codes, bits each."""
-    counts = np.bincount(codes, minlength=size)
-    shares = counts[counts > 0] / max(1, len(codes))
-    entropy = float(-(shares * np.log2(shares)).sum()) + 0.0
-    return {"codebook": size, "used": len(shares), "entropy": entropy}
+    counts = np.unique(codes, return_counts=True)[1]
+    return {"codebook": size, "used": len(counts), "entropy": float(entropy(counts, base=2))}
 
 
 def write_csv(path: Path, rows: Rows) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from nsvq_lightning.data.points import projected
-from nsvq_lightning.data.scene import Scene, spread
+from nsvq_lightning.data.scene import spread
 from nsvq_lightning.io.atomic import StrPath, write_text
 from nsvq_lightning.io.errors import Json
 from nsvq_lightning.io.nsvq.file import read_nsvq
@@ -33,11 +33,6 @@ REQUEST = "live.request"
 MAX_CAMERAS = 300
 
 
-def some_cameras(scene: Scene) -> dict[str, Camera]:
-    """Cameras of at most :data:`MAX_CAMERAS` photos by name, evenly spaced."""
-    return dict(spread(list(zip(scene.names, scene.cameras, strict=True)), MAX_CAMERAS))
-
-
 def write_viewer(path: StrPath, scene_file: StrPath, cameras: Mapping[str, Camera], title: str) -> int:
     """Write a page that holds a ``.nsvq`` file, its reader, a renderer and cameras; it loads nothing from elsewhere.
 
@@ -46,8 +41,8 @@ def write_viewer(path: StrPath, scene_file: StrPath, cameras: Mapping[str, Camer
     Args:
         path: HTML file to write, replaced atomically.
         scene_file: The ``.nsvq`` file, of which the page holds every byte.
-        cameras: At least one, by name; the page starts at the :func:`best_view`. They have the coordinates of the
-            file's positions.
+        cameras: At least one, by name, of which the page holds at most :data:`MAX_CAMERAS`, evenly spaced; it starts
+            at the :func:`best_view`. They have the coordinates of the file's positions.
         title: Name of the scene, plain text.
 
     Returns:
@@ -74,6 +69,7 @@ def viewer_page(scene_file: StrPath, cameras: Mapping[str, Camera], title: str, 
     """
     if not cameras:
         raise ValueError("a page needs at least one camera to start from, got none")
+    cameras = dict(spread(list(cameras.items()), MAX_CAMERAS))
     about, start, behind = "", 0, (0.0, 0.0, 0.0)
     if live is None or Path(scene_file).is_file():
         stored = read_nsvq(scene_file)

@@ -124,12 +124,16 @@ def _plain_content(path: Path) -> Any:
     except BadZipFile as error:
         raise FormatError(f"{path}: truncated, or not a checkpoint", WAY_OUT) from error
     except UnpicklingError as error:
-        named = re.search(r"GLOBAL (\S+)", str(error))
-        what = f"an object of {named[1]}" if named else "an object that is not plain data"
-        raise FormatError(f"{path}: refused, it holds {what}, and loading that could run code", WAY_OUT) from error
+        found = _named(error)
+        raise FormatError(f"{path}: refused, it holds {found}, and loading that could run code", WAY_OUT) from error
     except Exception as error:  # damage can make torch's archive and pickle readers raise anything
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise FormatError(f"{path}: damaged, or not a checkpoint ({reason})", WAY_OUT) from error
+
+
+def _named(error: UnpicklingError) -> str:
+    named = re.search(r"GLOBAL (\S+)", str(error))
+    return f"an object of {named[1]}" if named else "an object that is not plain data"
 
 
 def _check_contents(path: str | Path, checkpoint: Any) -> None:
@@ -191,16 +195,18 @@ def _is_harmless(text: str) -> bool:
 
 
 def scene_record(scene: Scene) -> Json:
-    """What a checkpoint remembers of its scene: the folder's name, and a digest of the pose of each view by name.
+    """What a checkpoint remembers of its scene: the folder's name, poses, and how it was read.
 
-    Neither the size of the photos nor the place of the folder, masks or the choice of test views change it.
+    A digest of the pose of each view by name depends neither on the place of the folder nor on how it was read: the
+    width of the first picture and the names of the test views.
     """
     digests = {}
     for name, camera in zip(scene.names, scene.cameras, strict=True):
         rotation, centre = camera.packed_view[:9], np.array(camera.packed_view[12:]) + scene.frame.origin
         pose = [*(round(value, 4) + 0.0 for value in rotation), f"{np.linalg.norm(centre):.3e}"]
         digests[name] = sha256(repr(pose).encode()).hexdigest()[:8]
-    return {"folder": scene.root.resolve().name, "views": digests}
+    read = [scene.cameras[0].width, *(scene.names[index] for index in scene.test)]
+    return {"folder": scene.root.resolve().name, "views": digests, "read": read}
 
 
 def check_scene(checkpoint: Mapping[str, Any], scene: Scene) -> None:
@@ -218,8 +224,8 @@ def check_scene(checkpoint: Mapping[str, Any], scene: Scene) -> None:
             f"views, and {same} of the {len(scene)} views of {scene.root} are among them with the same pose; pass "
             "--data.root with the folder it was trained on, or --trainer.allow_other_scene=true if that is meant"
         )
-    if stored["views"].keys() != own["views"].keys():
-        log.warning("%s has other photos than it was trained on: some of these may be test views now", scene.root)
+    if stored["views"].keys() != own["views"].keys() or stored.get("read", own["read"]) != own["read"]:
+        log.warning("%s has other photos, sizes or test views than the run so far: it may have seen these", scene.root)
 
 
 class PlainCheckpointIO(TorchCheckpointIO):
@@ -230,8 +236,15 @@ class PlainCheckpointIO(TorchCheckpointIO):
         if "://" in str(path):
             super().save_checkpoint(checkpoint, path, storage_options)
             return
-        content = BytesIO()  # straight into the file, torch would hide that a disk is full
+        content, states = BytesIO(), BytesIO()  # straight into the file, torch would hide that a disk is full
         torch.save(checkpoint, content)
+        torch.save(checkpoint.get("callbacks"), states)
+        states.seek(0)
+        try:
+            torch.load(states, weights_only=True)
+        except UnpicklingError as error:
+            found = _named(error)
+            raise ValueError(f"the state of a callback holds {found}, which no run could read: keep tensors") from error
         make_folder_of(Path(path))
         write_bytes(path, content.getvalue())
 

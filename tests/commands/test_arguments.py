@@ -224,13 +224,17 @@ def test_cameras_of_another_scene_are_not_used(
 ) -> None:
     root = _without_photos(demo_scene, tmp_path / "scene")
     path = root / "scene.ply"
-    points = load_scene(demo_scene).points
+    photos = load_scene(demo_scene)
+    points = photos.points
     own = CompressedScene.from_splats(random_splats(len(points))._replace(means=points))
     moved = replace(own, means=own.means + 20)
     for scene, count in ((own, 9), (moved, 0)):
         save(scene, path)
-        assert len(trained_scene(path, None).cameras) == count
         assert len(known_views(path, None, scene)[0]) == count
+    assert len(trained_scene(path, None).cameras) == 0
+    save(own, path)
+    assert len(trained_scene(path, None).cameras) == 9  # without photos, nobody knows which were trained by
+    assert len(trained_scene(path, demo_scene).cameras) == len(photos.train) == 7
     assert "scene.ply: the cameras of the folders beside it are not used: 9 cameras show " in caplog.text
     for wrong in (root, demo_scene):
         assert known_views(path, wrong, moved) == ({}, None)

@@ -127,6 +127,7 @@ def test_measuring_says_how_the_pictures_differ(tmp_path: Path, capsys: pytest.C
         ("a.nsvq a.nsvq --measure", "the input, which would be overwritten: name another output", 2),
         ("a.nsvq b.ply --crop 1 1 1 2 2 2 --measure", "--measure compares with the input as it is", 2),
         ("a.nsvq a.nsvq b.ply --measure", "--measure compares with the input as it is", 2),
+        ("a.nsvq a.nsvq b.ply --splats 50%", "thin each scene before they are joined", 2),
         ("a.nsvq b.ply --align x", "--align moves the cameras of a scene folder: add --data.root", 2),
         ("a.nsvq b.ply --up y --matrix 1 0 0 0 0 1 0 0 0 0 1 0", "not allowed with argument", 2),
         ("a.nsvq b.ply --matrix 1 0 0 0 0 2 0 0 0 0 1 0", "splats can be turned and scaled evenly only", 1),

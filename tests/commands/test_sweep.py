@@ -67,8 +67,14 @@ def test_everything_is_combined_with_everything(scenes: tuple[str, str]) -> None
     assert (last["model"]["seed"], last["data"]["init_args"]["seed"]) == (3, 3)
     assert (last["model"]["codebooks"], last["trainer"]["max_steps"]) == ("4k", 60)
     assert last["model"]["quantizer"]["class_path"].endswith(".NSVQ")
+    assert last["model"]["init_from"] is None
     assert runs[-1].folder.parent == Path("out/runs").resolve()
     assert runs[-1].folder.name.startswith("horns-default-NSVQ-4k-3-")
+
+
+def test_a_run_starts_from_the_same_file_in_any_folder(scenes: tuple[str, str]) -> None:
+    (run,) = planned(f"--scenes={scenes[0]}", "--model.init_from=a/scene.ply")
+    assert yaml.safe_load(run.config)["model"]["init_from"] == str(Path("a/scene.ply").absolute())
 
 
 def test_without_codebooks_there_is_one_run(scenes: tuple[str, str]) -> None:

@@ -19,6 +19,7 @@ from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import read_nsvq, save
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.report import viewer
 
 
@@ -37,10 +38,15 @@ def run(tmp_path: Path) -> Path:
     return folder
 
 
+def _photos(root: Path) -> dict[str, Camera]:
+    scene = load_scene(root)
+    return dict(zip(scene.names, scene.cameras, strict=True))
+
+
 @pytest.fixture
 def address(run: Path, demo_scene: Path) -> Iterator[str]:
     """A server that follows the run."""
-    page = viewer.viewer_page(run / "scene.nsvq", viewer.some_cameras(load_scene(demo_scene)), "run", live=0.2)
+    page = viewer.viewer_page(run / "scene.nsvq", _photos(demo_scene), "run", live=0.2)
     files = {"file": run / "scene.nsvq", "live": run / viewer.LIVE_SCENE}
     attributes = {"page": page.encode(), **files, "host": "127.0.0.1", "timeout": 0.5}
     with _Server(("127.0.0.1", 0), type("Handler", (_Handler,), attributes)) as server:

@@ -44,7 +44,7 @@ def test_the_list_has_the_kernels_of_a_run_and_no_others(tmp_path: Path) -> None
 
 FIRST = """
 from nsvq_lightning.compute import ahead, kernel_cache
-kernel, arguments = next(found for found in ahead.kernels() if found[0].__name__ == "_separate")
+kernel, arguments = next(found for found in ahead.kernels() if found[0].__name__ == "_search_before")
 kernel_cache.waits, kernel_cache.PATIENCE = {waits}, 0.2
 print(kernel._cache._cache_file._index_path)
 try:

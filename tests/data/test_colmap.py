@@ -110,7 +110,7 @@ def test_names_in_another_encoding_are_refused_by_file(make_scene: SceneFactory)
     for root in (make_scene("a"), _as_text(make_scene("b"))):
         path = next((root / "sparse" / "0").glob("images.*"))
         path.write_bytes(path.read_bytes().replace(b"003.png", b"caf\xe9png"))
-        with pytest.raises(SceneError, match=r"images\.(bin|txt): the name of a photo is not UTF-8"):
+        with pytest.raises(SceneError, match=r"images\.(bin|txt) names 'caf.*', which is not UTF-8: rename"):
             read_model(root)
 
 

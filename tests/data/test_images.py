@@ -85,6 +85,16 @@ def test_the_orientation_of_a_tiff_is_ignored_too(tmp_path: Path, orientation: i
     np.testing.assert_array_equal(read_image(path), picture)
 
 
+@pytest.mark.parametrize("suffix", [".tif", ".png"])
+def test_colours_are_not_those_before_black(tmp_path: Path, suffix: str) -> None:
+    """OpenCV multiplies the colours of TIFFs by their alpha."""
+    path, alpha = tmp_path / f"x{suffix}", np.full((6, 9, 1), 200, np.uint8)
+    PIL.Image.fromarray(np.concatenate([RGB, alpha], axis=2)).save(path)
+    picture = ImageSource(path, (9, 6), None, Pinhole(np.eye(3), 9, 6), has_alpha=True).load()
+    np.testing.assert_array_equal(picture.image, RGB)
+    assert picture.mask is None or picture.mask.all()
+
+
 def test_a_picture_may_have_the_pixels_of_a_phone(tmp_path: Path) -> None:
     PIL.Image.new("1", (16_320, 12_240)).save(tmp_path / "x.png")
     assert image_head(tmp_path / "x.png").size == (16_320, 12_240)

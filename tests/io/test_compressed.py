@@ -53,6 +53,13 @@ def test_cameras_of_some_scenes_are_not_those_of_all(caplog: pytest.LogCaptureFi
     assert "of some scenes the cameras of their training are known, of some not" in caplog.text
 
 
+def test_the_coarse_steps_of_one_scene_are_not_those_of_another() -> None:
+    coarse, fine = (replace(plain_scene(5, 1), config={"precision": {"position": step}}) for step in (0.1, 0.01))
+    assert CompressedScene.joined([coarse, coarse]).config == coarse.config
+    for others in ([coarse, fine], [coarse, plain_scene(5, 1)], [plain_scene(5, 1), coarse]):
+        assert "precision" not in CompressedScene.joined(others).config
+
+
 @pytest.mark.parametrize("cameras", [np.ones((65, 4)), np.ones((2, 3)), np.zeros((1, 4)), np.full((1, 4), np.inf)])
 def test_cameras_that_no_reader_takes_are_refused(cameras: NDArray[np.float64]) -> None:
     with pytest.raises(ValueError, match="cameras must be at most 64 finite positions"):

@@ -21,7 +21,7 @@ import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, Json, naming_file, wrong_start
+from nsvq_lightning.io.errors import FormatError, Json, json_object, naming_file, wrong_start
 from nsvq_lightning.rendering.sampling import MAX_CAMERAS
 from nsvq_lightning.splats.attributes import attribute_dims
 from nsvq_lightning.splats.conventions import Float64s
@@ -176,10 +176,7 @@ class Header:
         Raises:
             FormatError: An entry is missing or has the wrong type.
         """
-        try:
-            table = json.loads(text.decode(), parse_constant=_no_number)
-        except (ValueError, RecursionError) as error:
-            raise FormatError(f"damaged: the header is not JSON ({error})") from None
+        table = json_object(text, "the header")
         header = cls(
             level=_entry(table, "level", str),
             splats=_entry(table, "splats", int),
@@ -200,13 +197,9 @@ class Header:
         return header
 
 
-def _no_number(name: str) -> None:
-    raise ValueError(f"it holds {name}, which JSON does not have")
-
-
-def _entry(table: object, key: str, kind: type[_T]) -> _T:
+def _entry(table: Json, key: str, kind: type[_T]) -> _T:
     """An entry of a type; numbers must be finite and not negative."""
-    value: Any = table.get(key) if isinstance(table, dict) else None
+    value: Any = table.get(key)
     number = kind in _NUMBERS
     fits = type(value) in _NUMBERS if kind is float else type(value) is kind
     if not fits or (number and not 0 <= value <= sys.float_info.max):
