@@ -201,14 +201,14 @@ def test_a_config_of_something_else_names_no_photos(settings: str, tmp_path: Pat
     assert known_views(tmp_path / "scene.nsvq", None) == ({}, None)
 
 
-def test_a_port_in_use_is_told(
+def test_a_port_that_cannot_be_had_is_told(
     tmp_path: Path, demo_scene: Path, address: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save(random_splats(3), tmp_path / "scene.nsvq")
-    port = address.rpartition(":")[2]
-    arguments = ["view", str(tmp_path / "scene.nsvq"), "--data.root", str(demo_scene), "--port", port, "--no-open"]
-    assert main(arguments) == 1
-    assert f"cannot listen on 127.0.0.1:{port}" in capsys.readouterr().err
+    arguments = ["view", str(tmp_path / "scene.nsvq"), "--data.root", str(demo_scene), "--no-open"]
+    for port in (address.rpartition(":")[2], "99999", "-1"):
+        assert main([*arguments, f"--port={port}"]) == 1
+        assert f"cannot listen on 127.0.0.1:{port}" in capsys.readouterr().err
     assert len(read_nsvq(tmp_path / "scene.nsvq")) == 3
 
 
