@@ -168,12 +168,12 @@ class BudgetedGrowth(Densification):
     """Interval of opacity resets."""
     reset_last: int = 0
     """Last opacity reset; 0 for none. Long runs need them (docs/recipe.md)."""
+    reset_photos: Whole = 40
+    """None with fewer train photos, by which what resets clear away does not come back in its place."""
     reset_opacity: Opacity = 0.05
     """Opacities are reset to at most this."""
     recovery: Count = 600
     """Iterations after a reset at which those with the lowest opacity are pruned."""
-    recoveries: Whole = 2
-    """After how many resets, from the first, that is done."""
     recovery_share: Share = 0.2
     """Share of the splats that this prunes."""
     patience: Whole = 5
@@ -252,10 +252,12 @@ class BudgetedGrowth(Densification):
             self.prune(module, module.splats.opacities.sigmoid() < self.first_opacity)
         if self.is_due(module, iteration):
             self._split_and_prune(module, iteration)
-        resets = schedule.reset_times(self.reset_last, self.reset_every)
+        photos = getattr(run_scene.scene_of(trainer), "train", ())
+        last = self.reset_last * (len(photos) >= self.reset_photos)
+        resets = schedule.reset_times(last, self.reset_every)
         if iteration in resets:
             reset_opacities(module, self.reset_opacity)
-        if iteration in (reset + schedule.interval(self.recovery) for reset in resets[: self.recoveries]):
+        if iteration in (reset + schedule.interval(self.recovery) for reset in resets):
             transparency = -module.splats.opacities
             self.prune(module, top_rows(transparency, int(self.recovery_share * len(transparency))))
 

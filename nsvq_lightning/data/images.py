@@ -122,7 +122,7 @@ def _decoded(path: Path, flags: int) -> Arrays:
             # OpenCV applies the orientation to TIFFs even when told not to.
             applied = int(head.getexif().get(Base.Orientation, 1)) if head.format == "TIFF" else 1
             _check_whole(data)
-            if head.format == "TIFF" and head.mode == "RGBA" and flags == cv2.IMREAD_UNCHANGED:
+            if head.format == "TIFF" and head.mode == "RGBA":
                 image = cv2.cvtColor(np.asarray(head), cv2.COLOR_RGBA2BGRA)  # OpenCV would multiply colours by alpha
             else:
                 image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)

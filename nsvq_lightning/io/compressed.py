@@ -190,9 +190,8 @@ class CompressedScene:
                 codebooks[name] = np.concatenate(books)
             else:
                 raw[name] = np.concatenate([scene.rows(name) for scene in scenes])
-        config = dict(first.config)
-        if any(scene.config.get("precision") != config.get("precision") for scene in scenes):
-            config.pop("precision", None)  # that of one is too coarse for another
+        # Steps of one are too coarse for another.
+        same = len({str(scene.config.get("precision")) for scene in scenes}) == 1
         scenes = [scene.relative_to(first.origin) for scene in scenes]
         cameras = [scene.cameras for scene in scenes]
         if not all(map(len, cameras)):
@@ -206,7 +205,7 @@ class CompressedScene:
             codebooks,
             raw,
             sh_degree=degree,
-            config=config,
+            config=first.config if same else {**first.config, "precision": {}},
             origin=first.origin,
             cameras=fewer_cameras(np.concatenate(cameras)),
         )

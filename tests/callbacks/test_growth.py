@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from density_stage import Stage, make_splats
 from nsvq_lightning.callbacks import BudgetedGrowth
 from nsvq_lightning.callbacks.density import add_view
 from nsvq_lightning.callbacks.growth import splats_for_bytes, split_longest
+from nsvq_lightning.data.images import edges_of
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.rendering.camera import Camera
@@ -80,7 +82,7 @@ PHOTO[:, WIDTH // 2 :] = 200
 BATCH = View("a", 0, Camera(torch.eye(3), torch.eye(4), WIDTH, HEIGHT), PHOTO)
 RULES: dict[str, Any] = {
     **{"start": 0, "full": 100, "every": 10, "first_prune": 5, "reset_every": 40, "reset_last": 80},
-    **{"recovery": 7, "recoveries": 1, "min_splats": 2},
+    **{"recovery": 7, "reset_photos": 0, "min_splats": 2},
 }
 SCHEDULE = Schedule(
     total=200,
@@ -182,8 +184,17 @@ def test_opacities_are_reset_and_the_faintest_go_when_the_others_have_recovered(
     stage.step(47, batch=BATCH)
     assert stage.opacities == pytest.approx([0.05] * 8)  # a fifth of them went
     stage.step(80, batch=BATCH)
-    stage.step(87, batch=BATCH)  # only after the first reset
-    assert stage.count == 8
+    stage.step(87, batch=BATCH)
+    assert stage.count == 7
+
+
+def test_opacities_are_not_reset_where_photos_are_few() -> None:
+    for photos, ceiling in ((39, 0.9), (40, 0.05)):
+        stage = stage_of([0.9] * 10, BudgetedGrowth(**RULES | {"reset_photos": 40}, budget=1000))
+        images = SimpleNamespace(edges=lambda index: edges_of(PHOTO, None))
+        stage.trainer.datamodule = SimpleNamespace(scene=SimpleNamespace(train=range(photos), images=images))
+        stage.step(40, batch=BATCH)
+        assert stage.opacities == pytest.approx([ceiling] * 10)
 
 
 def test_nothing_happens_after_warm_up() -> None:

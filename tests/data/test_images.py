@@ -93,6 +93,7 @@ def test_colours_are_not_those_before_black(tmp_path: Path, suffix: str) -> None
     picture = ImageSource(path, (9, 6), None, Pinhole(np.eye(3), 9, 6), has_alpha=True).load()
     np.testing.assert_array_equal(picture.image, RGB)
     assert picture.mask is None or picture.mask.all()
+    np.testing.assert_array_equal(read_image(path), RGB)
 
 
 def test_a_picture_may_have_the_pixels_of_a_phone(tmp_path: Path) -> None:

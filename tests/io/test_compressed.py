@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from viewer_scenes import plain_scene
 
 from nsvq_lightning.io.compressed import CompressedScene, attribute_errors
+from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.io.placing import cropped
 
 
@@ -57,7 +58,7 @@ def test_the_coarse_steps_of_one_scene_are_not_those_of_another() -> None:
     coarse, fine = (replace(plain_scene(5, 1), config={"precision": {"position": step}}) for step in (0.1, 0.01))
     assert CompressedScene.joined([coarse, coarse]).config == coarse.config
     for others in ([coarse, fine], [coarse, plain_scene(5, 1)], [plain_scene(5, 1), coarse]):
-        assert "precision" not in CompressedScene.joined(others).config
+        assert Storage.told(CompressedScene.joined(others).config) == Storage()
 
 
 @pytest.mark.parametrize("cameras", [np.ones((65, 4)), np.ones((2, 3)), np.zeros((1, 4)), np.full((1, 4), np.inf)])

@@ -64,7 +64,15 @@ def recipe_options(**replaced: Callback | None) -> dict[str, Callback | None]:
         "sh_degree": ShDegreeSchedule(every=10),
         "budget": SplatBudget(splats=BUDGET),
         "density": BudgetedGrowth(
-            start=0, full=20, every=4, grad_threshold=1e-6, first_prune=3, reset_every=9, reset_last=9, recovery=3
+            start=0,
+            full=20,
+            every=4,
+            grad_threshold=1e-6,
+            first_prune=3,
+            reset_every=9,
+            reset_last=9,
+            reset_photos=0,
+            recovery=3,
         ),
         "selection": SplatSelection(),
         "opacity": None,

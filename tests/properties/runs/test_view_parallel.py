@@ -38,7 +38,8 @@ LOSSES, GRADIENTS = (7, 43), (13, 46)
 """Iterations in which the second view has a loss or a gradient that is not finite: in warm-up and quantize phase, where
 nothing else changes the splats."""
 
-GROWTH = {"start": 0, "full": 20, "every": 4, "grad_threshold": 1e-6, "reset_every": 9, "reset_last": 9, "recovery": 3}
+RESETS = {"reset_every": 9, "reset_last": 9, "reset_photos": 0, "recovery": 3}
+GROWTH = {"start": 0, "full": 20, "every": 4, "grad_threshold": 1e-6, **RESETS}
 RECIPE = [
     *("--callbacks.phases.reference_total=60", "--callbacks.phases.min_reset_interval=1", "--splats=500"),
     *("--callbacks.phases.warmup_end=24", "--callbacks.phases.prune_end=40", "--callbacks.phases.quantize_end=50"),
