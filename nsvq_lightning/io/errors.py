@@ -63,7 +63,7 @@ def json_object(text: bytes, name: str) -> Json:
         FormatError: It holds something else.
     """
     try:
-        found = json.loads(text, parse_constant=_no_number)
+        found = json.loads(text.decode(), parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
         raise FormatError(f"damaged: {name} is not JSON ({error})") from None
     if not isinstance(found, dict):

@@ -243,8 +243,7 @@ class PlainCheckpointIO(TorchCheckpointIO):
         try:
             torch.load(states, weights_only=True)
         except UnpicklingError as error:
-            found = _named(error)
-            raise ValueError(f"the state of a callback holds {found}, which no run could read: keep tensors") from error
+            raise ValueError(f"a callback keeps {_named(error)}, which no run could read: make it a tensor") from error
         make_folder_of(Path(path))
         write_bytes(path, content.getvalue())
 

@@ -251,7 +251,7 @@ def test_checkpoints_are_written_where_they_belong(tmp_path: Path, monkeypatch: 
     assert torch.equal(torch.load(path)["a"], torch.ones(3))
     assert list(path.parent.iterdir()) == [path]
     with pytest.raises(
-        ValueError, match=r"the state of a callback holds an object of numpy\..* which no run could read: keep tensors"
+        ValueError, match=r"a callback keeps an object of numpy\..* which no run could read: make it a tensor"
     ):
         PlainCheckpointIO().save_checkpoint({"callbacks": {"Own": {"seen": np.zeros(3)}}}, path)
     assert torch.equal(torch.load(path)["a"], torch.ones(3))
