@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.distributed
-from scipy.stats import entropy
+from scipy import stats
 from torch import Tensor
 
 from nsvq_lightning.data.scene import View
@@ -117,7 +117,7 @@ def write_metrics(path: Path, metrics: Values) -> None:
 def _codes_in_use(codes: Integers, size: int) -> Json:
     """Rows of the codebook, how many of them are used, and the entropy of the codes, bits each."""
     counts = np.unique(codes, return_counts=True)[1]
-    return {"codebook": size, "used": len(counts), "entropy": float(entropy(counts, base=2))}
+    return {"codebook": size, "used": len(counts), "entropy": float(stats.entropy(counts, base=2))}
 
 
 def write_csv(path: Path, rows: Rows) -> None:
