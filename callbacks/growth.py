@@ -169,7 +169,7 @@ class BudgetedGrowth(Densification):
     reset_last: int = 0
     """Last opacity reset; 0 for none. Long runs need them (docs/recipe.md)."""
     reset_photos: Whole = 40
-    """None with fewer train photos, by which what resets clear away does not come back in its place."""
+    """None with fewer train photos, or without a scene: what resets clear away would not come back in its place."""
     reset_opacity: Opacity = 0.05
     """Opacities are reset to at most this."""
     recovery: Count = 600

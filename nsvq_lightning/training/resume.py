@@ -232,7 +232,11 @@ class PlainCheckpointIO(TorchCheckpointIO):
     """Lightning's reading and writing of checkpoints; local files with :func:`read_checkpoint` and in their folder."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Write a checkpoint in one step; Lightning first writes it where the system has temporary files."""
+        """Write a checkpoint in one step; Lightning first writes it where the system has temporary files.
+
+        Raises:
+            ValueError: A callback's state is more than tensors and plain data, so that no run could read it.
+        """
         if "://" in str(path):
             super().save_checkpoint(checkpoint, path, storage_options)
             return
