@@ -26,13 +26,10 @@ def turn_up(up: Float64s, axis: str) -> Float64s:
         up: Direction ``[3]`` of length 1.
         axis: One of :data:`UP_AXES`.
     """
-    goal = np.array([0.0, -1.0, 0.0])
-    # Two reflections: one that swaps opposite directions needs another mirror than the one between them.
-    between = up + goal
-    if between @ between < 1e-12:
-        return np.asarray(UP_AXES[axis] @ UP_AXES["y"])
-    first, second = (np.eye(3) - 2 * np.outer(v, v) / (v @ v) for v in (goal, between))
-    return np.asarray(UP_AXES[axis] @ first @ second)
+    from scipy.spatial.transform import Rotation
+
+    lift, _ = Rotation.align_vectors([0.0, -1.0, 0.0], up)
+    return np.asarray(UP_AXES[axis] @ lift.as_matrix())
 
 
 # Half around z: right, down, front becomes left, up, front, the axes of glTF and USD.
