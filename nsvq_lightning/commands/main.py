@@ -37,7 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0, 1 after an error in the user's files, 130 after Ctrl-C, 143 after SIGTERM. Wrong arguments end
         the process with status 2.
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    home = os.path.expanduser("~")  # which no shell puts into --output=~/scene.ply
+    arguments = [text.replace("=~/", f"={home}/") for text in (sys.argv[1:] if argv is None else argv)]
     name = arguments[0] if arguments else ""
     if name in ("", "--help", "-h", "help"):
         sys.stdout.write(overview())

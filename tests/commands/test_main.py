@@ -327,3 +327,15 @@ def test_a_closed_output_ends_no_command(tmp_path: Path, monkeypatch: pytest.Mon
     assert main(["convert", str(tmp_path / "scene.ply"), str(tmp_path / "x.nsvq"), "--crop", *nowhere]) == 1
     for stream in (sys.stdout, sys.stderr):
         stream.close()
+
+
+def test_home_is_found_behind_an_equals_sign(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where no shell puts it."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    write_ply("x.ply", plain_scene(5, 0))
+    assert main(["render", "x.ply", "--output=~/missing/x.pdf"]) != 0
+    assert f"{tmp_path}/missing/x.pdf" in capsys.readouterr().err

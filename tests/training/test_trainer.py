@@ -112,3 +112,10 @@ def test_validation_is_of_all_test_views(demo_scene: Path, tmp_path: Path) -> No
     trainer = SplatTrainer(accelerator="cpu", default_root_dir=tmp_path, enable_progress_bar=False)
     (figures,) = trainer.validate(module, datamodule=ColmapDataModule(str(demo_scene)), verbose=False)
     assert figures["val/psnr"] > 0
+
+
+def test_epochs_that_end_nothing_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    SplatTrainer(max_epochs=-1, max_steps=100, accelerator="cpu", default_root_dir=tmp_path)
+    assert "max_epochs" not in caplog.text
+    SplatTrainer(max_epochs=3, max_steps=100, accelerator="cpu", default_root_dir=tmp_path)
+    assert "max_epochs=3 ends nothing" in caplog.text
