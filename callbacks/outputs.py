@@ -17,6 +17,7 @@ from nsvq_lightning.io.formats import FORMATS, save
 from nsvq_lightning.io.nsvq.file import as_stored
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.io.placing import placed
+from nsvq_lightning.rendering.camera_paths import CAMERAS
 from nsvq_lightning.report import pictures, viewer
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
@@ -32,7 +33,8 @@ class ExportScene(WritingCallback):
     """Writes the scene when training ends.
 
     The compressed scene is ``scene.nsvq``, and ``scene.ply`` has its decoded splats, for any viewer. With
-    ``scene.nsvq`` comes ``viewer.html``, a page that holds it and shows it in a browser.
+    ``scene.nsvq`` come ``viewer.html``, a page that holds it and shows it in a browser, and ``cameras.json``, the
+    cameras of the photos, for commands that look at the run where there are no photos.
 
     Raises:
         ValueError: An unknown format.
@@ -64,8 +66,9 @@ class ExportScene(WritingCallback):
         if "nsvq" in self.formats and photos is not None:
             page = folder / "viewer.html"
             title = page.resolve().parent.parent.name
+            cameras = dict(zip(photos.names, photos.cameras, strict=True))
             with optional(page):
-                cameras = dict(zip(photos.names, photos.cameras, strict=True))
+                viewer.write_cameras(folder / CAMERAS, cameras)
                 size = viewer.write_viewer(page, folder / "scene.nsvq", cameras, title)
                 log.info("wrote %s (%d bytes)", page, size)
 

@@ -5,7 +5,6 @@ import logging
 import math
 import re
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -155,12 +154,14 @@ def _found_views(path: Path, root: Path | None, origin: "Place") -> "Views":
     from nsvq_lightning.data.scene import load_cameras, load_scene
     from nsvq_lightning.data.transforms import has_poses
     from nsvq_lightning.rendering.camera_paths import CAMERAS, read_cameras
-    from nsvq_lightning.report.viewer import page_cameras
 
-    run = _run_of(path).resolve()
     data: dict[str, Any] = {}
-    with suppress(KeyError, TypeError):  # a config of something else
+    try:
         data = {} if root else {**check_config(str(_run_of(path) / "config.yaml"))["data"]["init_args"]}
+    except (KeyError, TypeError):  # a config of something else
+        pass
+    except ValueError as error:
+        log.warning("%s", error)
     folder = root
     if given := data.get("root"):
         folder = Path(given).expanduser()
@@ -174,21 +175,18 @@ def _found_views(path: Path, root: Path | None, origin: "Place") -> "Views":
             log.info("%s has cameras, but no photos", folder)
             return load_cameras(folder, **how), None
         return dict(zip(scene.names, scene.cameras, strict=True)), scene
-    if folder is None and (run / "viewer.html").is_file():
-        return page_cameras(run / "viewer.html"), None
     for place in [folder] if folder else folders_beside(path):
-        if (place / CAMERAS).is_file():
-            return read_cameras(place / CAMERAS), None
-        if has_poses(place):
-            return load_cameras(place, origin=origin), None
+        is_list = (place / CAMERAS).is_file()
+        if is_list or has_poses(place):
+            log.info("%s: its cameras are taken from %s", path, place)
+            return read_cameras(place / CAMERAS) if is_list else load_cameras(place, origin=origin), None
     return {}, None
 
 
 def known_views(path: Path, root: Path | None, scene: "CompressedScene | None" = None) -> "Views":
     """Cameras by name of the photos that a scene was trained on, or that its run or trainer has left beside it.
 
-    They are looked for as ``viewer.html`` in the folder of a run, as ``cameras.json`` of INRIA's trainer, as a COLMAP
-    model or as a transforms file.
+    They are looked for as ``cameras.json``, of a run or of INRIA's trainer, as a COLMAP model or as a transforms file.
 
     Args:
         path: A scene file, or the folder of a run.
@@ -251,6 +249,7 @@ def scene_with_views(
         ValueError: The folder ``root`` is not a scene. What is damaged beside the file is a warning.
     """
     from nsvq_lightning.io.compressed import on_white
+    from nsvq_lightning.rendering.camera_paths import arguments_of
     from nsvq_lightning.rendering.sampling import trained_by
 
     cameras: list[Camera] = []
@@ -266,7 +265,8 @@ def scene_with_views(
         trained = photos.train_cameras if photos else cameras
         log.info("%s: blur and size are those of %d cameras that it was trained by", path, len(trained))
         scene = replace(scene, cameras=trained_by(trained))
-    if photos and photos.white:
+    arguments = map(arguments_of, folders_beside(path))
+    if (photos and photos.white) or any("white_background=True" in given for given in arguments):
         scene = on_white(scene)
     return scene, cameras, photos
 

@@ -41,6 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--no-open", dest="open", action="store_false", help="do not open the browser")
 
 
+# Bytes of a scene, four characters of a page for three of them; V8 has strings of at most 2²⁹.
+_LARGEST = 400_000_000
+
+
 def run(options: argparse.Namespace) -> int:
     """Serve a scene until Ctrl-C, or write its page.
 
@@ -61,6 +65,8 @@ def run(options: argparse.Namespace) -> int:
         cameras = _cameras(options, file)
         if options.output is not None:
             make_folder_of(options.output)
+            if file.stat().st_size > _LARGEST:
+                raise ValueError(f"{path}: browsers open no page so large: nsvq compress makes it smaller")
             size = write_viewer(options.output, file, cameras, title)
             say(f"{options.output}: {size:,} bytes")
             return 0
@@ -86,10 +92,12 @@ def run(options: argparse.Namespace) -> int:
 def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
     """The scene that is meant, as a ``.nsvq`` file; that of a running fit is yet to come."""
     from nsvq_lightning.io.formats import save
+    from nsvq_lightning.io.nsvq.header import read_header
     from nsvq_lightning.io.nsvq.precision import Storage
 
     file = options.scene / "scene.nsvq" if options.live else scene_file(options.scene)
-    if file.suffix.lower() == ".nsvq":
+    is_ours = file.suffix.lower() == ".nsvq"
+    if options.live or (is_ours and (options.root is None or read_header(file).cameras)):
         yield file
         return
     with tempfile.TemporaryDirectory() as folder:
@@ -103,16 +111,14 @@ def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.io.formats import read_scene
 
-    # What a run has recorded are its own, and need no look at the scene.
-    is_own = options.root is None and (options.scene / "viewer.html").is_file()
-    scene = None if options.live or is_own else read_scene(file)
+    scene = None if options.live else read_scene(file)
     cameras, _ = known_views(options.scene, options.root, scene)
     if cameras:
         return cameras
-    if options.live:
+    if scene is None:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
     sys.stderr.write("no photos: cameras are guessed from the scene; --data.root names the folder of the photos\n")
-    guesses = likely_cameras((scene or read_scene(file)).decode(), 12)
+    guesses = likely_cameras(scene.decode(), 12)
     return {f"guess {index}": camera for index, camera in enumerate(guesses, 1)}
 
 

@@ -18,6 +18,11 @@ from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.rendering.poses import looked_at, poses, up_of, view_from, view_towards
 from nsvq_lightning.splats.conventions import Float64s
 
+# File beside the scene of a run, or of INRIA's trainer, or two folders above it.
+CAMERAS = "cameras.json"
+# The lens of a camera in JSON files, in pixels.
+LENS = ("fx", "fy", "cx", "cy")
+
 
 def reframed(camera: Camera, width: int, height: int) -> Camera:
     """The camera with another picture size: all that it sees stays in view, centred."""
@@ -160,16 +165,15 @@ def _entry_camera(entry: Mapping[str, Any], width: int, height: int) -> Camera:
     return camera_of(view_from(rotation, pose[:3, 3]), (focal, focal, width / 2, height / 2), width, height)
 
 
-# File beside a scene of INRIA's trainer, or two folders above it.
-CAMERAS = "cameras.json"
 # Pixels of a picture's side.
 _MAX_SIDE = 1 << 16
 
 
 def read_cameras(path: Path) -> dict[str, Camera]:
-    """The cameras of photos by name, as INRIA's trainer lists them; their principal points are in the middle.
+    """The cameras of photos by name, as a run (:func:`nsvq_lightning.report.viewer.write_cameras`) and INRIA list them.
 
-    It lists them in the size of the photos, which it trains with as its ``cfg_args`` beside the list says.
+    INRIA's trainer has principal points in the middle, and lists them in the size of the photos, which it trains with
+    as its ``cfg_args`` beside the list says.
 
     Args:
         path: JSON, a list of ``img_name``, ``width``, ``height``, ``fx``, ``fy`` (pixels), ``rotation`` (from the
@@ -188,11 +192,13 @@ def read_cameras(path: Path) -> dict[str, Camera]:
             width, height = int(entry["width"]), int(entry["height"])
             if max(width, height) > _MAX_SIDE:
                 raise ValueError(f"a picture of {width}x{height}")
-            lens = entry["fx"], entry["fy"], width / 2, height / 2
+            lens = [
+                entry.get(key, middle) for key, middle in zip(LENS, (None, None, width / 2, height / 2), strict=True)
+            ]
             name = str(entry["img_name"])
             if name in cameras:  # the names of photos in several folders, without these
                 name = f"{name} ({entry['id']})"
-            times = _times_smaller(path.with_name("cfg_args"), width)
+            times = 1 if "cx" in entry else _times_smaller(arguments_of(path.parent), width)
             small = tuple(number / times for number in lens)
             size = round(width / times), round(height / times)
             cameras[name] = camera_of(view_from(rotation, position), small, *size)
@@ -202,10 +208,15 @@ def read_cameras(path: Path) -> dict[str, Camera]:
     return {name: replace(camera, near=near) for name, camera in cameras.items()}
 
 
-def _times_smaller(arguments: Path, width: int) -> float:
+def arguments_of(folder: Path) -> str:
+    """What INRIA's trainer, whose folder it is, was called with; nothing in another folder."""
+    path = folder / "cfg_args"
+    return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+
+
+def _times_smaller(arguments: str, width: int) -> float:
     """How many times smaller than the photos, ``width`` pixels wide, INRIA's trainer was asked to train them."""
-    text = arguments.read_text(encoding="utf-8", errors="replace") if arguments.is_file() else ""
-    found = re.search(r"\bresolution=(-?\d+)", text)
+    found = re.search(r"\bresolution=(-?\d+)", arguments)
     asked = int(found[1]) if found else -1
     if asked in (1, 2, 4, 8):
         return asked

@@ -2,7 +2,6 @@
 
 import base64
 import json
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from html import escape
@@ -12,19 +11,17 @@ from string import Template
 from typing import Any
 
 import numpy as np
-import torch
 
 from nsvq_lightning.data.points import projected
 from nsvq_lightning.data.scene import spread
 from nsvq_lightning.io.atomic import StrPath, write_text
 from nsvq_lightning.io.errors import Json
 from nsvq_lightning.io.nsvq.file import read_nsvq
-from nsvq_lightning.rendering.camera import Camera, camera_of
-from nsvq_lightning.rendering.constants import NEAR
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.camera_paths import LENS
 from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.splats.splats import SplatTensors
 
-_LENS = ("fx", "fy", "cx", "cy")
 # File whose time of modification says when a viewer last asked.
 REQUEST = "live.request"
 
@@ -87,7 +84,7 @@ def viewer_page(scene_file: StrPath, cameras: Mapping[str, Camera], title: str, 
         "cameras": [{"name": name, **camera_entry(camera)} for name, camera in cameras.items()],
         "background": behind,
         "up": up_of(list(cameras.values())).tolist(),
-        "near": min(camera.near for camera in cameras.values()),
+        "near": float(min(camera.near for camera in cameras.values())),
         "start": start,
     }
     return fill(
@@ -131,35 +128,31 @@ def camera_entry(camera: Camera) -> Json:
     pose = [*np.stack([right, -down, -forward, position], axis=1).ravel(), 0.0, 0.0, 0.0, 1.0]
     return {
         "camera_to_world": [float(f"{value:.9g}") + 0.0 for value in pose],
-        "width": camera.width,
-        "height": camera.height,
-        **dict(zip(_LENS, camera.intrinsics, strict=True)),
+        **lens_entry(camera),
     }
 
 
-def page_cameras(path: StrPath) -> dict[str, Camera]:
-    """The cameras that a page of :func:`write_viewer` lists, by name; none if it is another page.
+def lens_entry(camera: Camera) -> dict[str, float]:
+    """Width, height, focal lengths and principal point of a camera in pixels, as JSON files have them."""
+    lens = dict(zip(LENS, camera.intrinsics, strict=True))
+    return {"width": int(camera.width), "height": int(camera.height), **lens}
 
-    Raises:
-        ValueError: They are damaged.
-        OSError: It cannot be read.
-    """
-    text = Path(path).read_text(encoding="utf-8")
-    found = re.search(r'<script id="scene" type="application/json">(.*)</script>', text)
-    cameras = {}
-    opengl = torch.tensor([1.0, -1.0, -1.0, 1.0])
-    try:
-        scene: Json = json.loads(found[1]) if found else {"cameras": ()}
-        near = float(scene.get("near", NEAR))
-        for entry in scene["cameras"]:
-            name = str(entry["name"])
-            pose = torch.tensor(entry["camera_to_world"], dtype=torch.float64).view(4, 4)
-            viewmat = (pose * opengl).inverse().float()
-            lens = tuple(entry[key] for key in _LENS)
-            cameras[name] = camera_of(viewmat, lens, int(entry["width"]), int(entry["height"]), near)
-    except (ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise ValueError(f"the cameras in {path} are damaged ({error}): name the photos with --data.root") from error
-    return cameras
+
+def write_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
+    """Write cameras as INRIA's trainer lists them, which viewers read, with their principal points beside."""
+    entries = []
+    for number, (name, camera) in enumerate(cameras.items()):
+        pose = camera.viewmat.double().inverse()
+        entries.append(
+            {
+                "id": number,
+                "img_name": name,
+                "position": pose[:3, 3].tolist(),
+                "rotation": pose[:3, :3].tolist(),
+                **lens_entry(camera),
+            }
+        )
+    write_text(path, json.dumps(entries))
 
 
 def web_source(name: str) -> str:

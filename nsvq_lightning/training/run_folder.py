@@ -139,6 +139,7 @@ def _let_go_of_all() -> None:
 # Files that show that a folder holds a run.
 RUN_FILES = (
     "scene.nsvq",
+    "cameras.json",
     "metrics.json",
     "metrics.csv",
     "curve.csv",

@@ -27,6 +27,7 @@ from nsvq_lightning.commands.arguments import (
     unknown_option,
     views_of,
 )
+from nsvq_lightning.commands.main import main
 from nsvq_lightning.data.scene import load_cameras, load_scene
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import read_scene, save
@@ -111,6 +112,22 @@ def test_cameras_of_inrias_trainer_lie_up_to_two_folders_above_the_scene(tmp_pat
         views = views_of(scene, CompressedScene.from_splats(random_splats(9)), 5, None)
         assert [(view.width, view.height) for view in views] == [(8, 6)]
         assert views[0].position.tolist() == [0, 0, -6]
+
+
+def test_what_inrias_trainer_saw_in_front_of_white_is_white(tmp_path: Path) -> None:
+    scene = tmp_path / "point_cloud" / "iteration_7" / "point_cloud.ply"
+    scene.parent.mkdir(parents=True)
+    save(random_splats(9), scene)
+    (tmp_path / "cameras.json").write_text(json.dumps([ENTRY]))
+    for white in (False, True):
+        (tmp_path / "cfg_args").write_text(f"Namespace(resolution=-1, white_background={white})")
+        assert trained_scene(scene, None).background == (float(white),) * 3
+
+
+def test_a_page_of_guessed_cameras_is_no_source_of_cameras(tmp_path: Path) -> None:
+    save(random_splats(30), tmp_path / "scene.ply")
+    assert main(["view", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "viewer.html")]) == 0
+    assert known_views(tmp_path / "scene.ply", None) == ({}, None)
 
 
 def test_a_scene_has_the_cameras_that_lie_beside_it(

@@ -14,8 +14,9 @@ from nsvq_lightning.commands.main import main
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import load, save
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.camera_paths import read_cameras
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.report.viewer import page_cameras, write_viewer
+from nsvq_lightning.report.viewer import write_cameras
 
 
 @pytest.fixture
@@ -66,7 +67,7 @@ def test_a_run_knows_its_cameras_without_its_photos(
 ) -> None:
     save(random_splats(50), tmp_path / "scene.nsvq")
     cameras = load_scene(demo_scene).cameras
-    write_viewer(tmp_path / "viewer.html", tmp_path / "scene.nsvq", dict(zip("<bcdefgh&", cameras, strict=True)), "t")
+    write_cameras(tmp_path / "cameras.json", dict(zip("<bcdefgh&", cameras, strict=True)))
     (tmp_path / "config.yaml").write_text("data: {class_path: x, init_args: {root: gone}}")
     assert _run(tmp_path, "--path", "cameras", "-o", tmp_path / "frames") == 0
     expected = (render(load(tmp_path / "scene.nsvq"), cameras[4]).image.detach().clamp(0, 1) * 255).numpy()
@@ -74,15 +75,19 @@ def test_a_run_knows_its_cameras_without_its_photos(
     assert _run(tmp_path, "--path", "cameras", "--frames", "3", "-o", tmp_path / "few") == 1
     assert "cameras has frames of its own" in capsys.readouterr().err
     assert main(["view", str(tmp_path), "-o", str(tmp_path / "page.html")]) == 0
-    found = page_cameras(tmp_path / "page.html")
+    found = read_cameras(tmp_path / "cameras.json")
     assert list(found) == list("<bcdefgh&")
-    assert torch.allclose(found["b"].viewmat, cameras[1].viewmat, atol=1e-6)
+    for one, other in zip(found.values(), cameras, strict=True):
+        assert torch.allclose(one.viewmat, other.viewmat, atol=1e-6)
+        assert one.intrinsics == pytest.approx(other.intrinsics)
+        assert (one.width, one.height) == (other.width, other.height)
     assert "guessed" not in capsys.readouterr().err
-    (tmp_path / "viewer.html").write_text('<script id="scene" type="application/json">{"cameras": [{}]}</script>')
+    (tmp_path / "cameras.json").write_text("[{}]")
     assert _run(tmp_path, "--path", "cameras") == 1
     assert "--path cameras needs cameras of photos: name their folder (--data.root)" in capsys.readouterr().err
     (warning,) = (record.message for record in caplog.records if record.levelname == "WARNING")
-    assert "viewer.html are damaged ('name'): name the photos with --data.root" in warning
+    assert "cameras.json is no list of cameras" in warning
+    assert "name the photos with --data.root" in warning
 
 
 def test_without_photos_cameras_are_guessed(tmp_path: Path) -> None:
@@ -92,6 +97,13 @@ def test_without_photos_cameras_are_guessed(tmp_path: Path) -> None:
     pictures = [_picture(path) for path in sorted(out.iterdir())]
     assert [picture.shape for picture in pictures] == [(30, 40, 3)] * 3
     assert all(picture.max() == 255 and picture.min() < 200 for picture in pictures)
+
+
+def test_a_folder_with_a_dot_is_a_folder(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "frames.2"
+    out.mkdir()
+    assert _run(scene, "--seconds", "0.1", "--fps", "20", "-o", out, "--size", "40x30") == 0
+    assert len([*out.iterdir()]) == 2
 
 
 def test_keyframes_are_followed(scene: Path, demo_scene: Path, tmp_path: Path) -> None:

@@ -172,8 +172,6 @@ def test_any_scene_becomes_one_page(tmp_path: Path, demo_scene: Path, capsys: py
         (["no/run"], "there is no file or folder no/run"),
         (["."], "holds no scene.nsvq"),
         ([".", "--live"], "does not say where its photos"),
-        (["list/scene.nsvq"], "config list/config.yaml holds list"),
-        (["broken/scene.nsvq"], "config broken/config.yaml is not YAML"),
     ],
 )
 def test_errors_are_one_line(
@@ -184,15 +182,25 @@ def test_errors_are_one_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for name, settings in (("list", "[1, 2]"), ("broken", "data: {")):
-        Path(name).mkdir()
-        Path(name, "config.yaml").write_text(settings)
-        save(random_splats(3), Path(name, "scene.nsvq"))
     assert main(["view", *arguments, "--no-open"]) == 1
     said = capsys.readouterr().err
     assert said.startswith("nsvq view: ")
     assert words in said
     assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [("[1, 2]", "config.yaml holds list"), ("data: {", "is not YAML"), ("a: !!python/object:x.Y {}", "is not YAML")],
+)
+def test_a_config_that_cannot_be_read_is_told_and_names_no_photos(
+    settings: str, words: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "config.yaml").write_text(settings)
+    save(random_splats(30), tmp_path / "scene.ply")
+    assert main(["view", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "page.html")]) == 0
+    assert words in caplog.text
+    assert "guess 1" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("settings", ["data: 3", "data: {init_args: [1]}", "data: {root: 5}", "model: {}"])
