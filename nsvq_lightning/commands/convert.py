@@ -23,7 +23,7 @@ from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import add_root, known_views, trained_scene, views_of
 from nsvq_lightning.commands.compress import share_or_number, splats_left, written_error
 from nsvq_lightning.io import formats, lod, placing, spz
-from nsvq_lightning.io.compressed import CompressedScene, attribute_errors, on_white, renderer
+from nsvq_lightning.io.compressed import CompressedScene, on_white, renderer
 from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
 from nsvq_lightning.io.sog import PALETTE_LIMIT
 from nsvq_lightning.splats.conventions import Float64s
@@ -81,16 +81,10 @@ def run(options: argparse.Namespace) -> int:
     scene = _edited(CompressedScene.joined([read(path) for path in options.inputs]), options)
     writer = {"palette": options.palette, "version": options.spz_version, "axes": options.spz_axes}
     given = {name: value for name, value in writer.items() if value is not None}
-    if entry.in_order is not None:  # at once, so that no copy is held beside it
-        scene = entry.in_order(scene)
     size = formats.save(scene, output, Storage(options.level) if options.level else None, **given)
     # What reading the output back would say of it is known here.
     logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
     say(f"{output}: {len(scene):,} splats in {size:,} bytes, {size / len(scene):.1f} per splat")
-    if entry.in_order is not None:  # the format is not exact
-        errors = attribute_errors(formats.read_scene(output), scene)
-        listed = ", ".join(f"{name} {error:.2g}{'°' * (name == 'rotation')}" for name, error in errors.items())
-        say(f"  root mean square errors: {listed}")
     if options.measure:
         _measure(options.inputs[0], output, options.root)
     return 0

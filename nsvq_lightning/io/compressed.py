@@ -2,7 +2,6 @@
 
 import logging
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -11,10 +10,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from nsvq_lightning.io.errors import FormatError
-from nsvq_lightning.io.numbers import opacity_of
 from nsvq_lightning.rendering.sampling import MAX_CAMERAS, Sampling, fewer_cameras
 from nsvq_lightning.splats import attributes as splat
-from nsvq_lightning.splats.conventions import Arrays, Bools, Float32s, Float64s, Integers, shN_degree, unit
+from nsvq_lightning.splats.conventions import Arrays, Bools, Float32s, Float64s, Integers, shN_degree
 
 if TYPE_CHECKING:
     from torch.nn import ParameterDict
@@ -393,41 +391,3 @@ def _check_codes(name: str, codes: Integers, codebook: Float32s, n: int, dim: in
         raise ValueError(f"codebooks[{name!r}] is empty; a codebook needs at least one row")
     if n and not (codes.min() >= 0 and codes.max() < rows):
         raise ValueError(f"codes[{name!r}] must be in 0..{rows - 1}, got {codes.min()}..{codes.max()}")
-
-
-def attribute_errors(read: CompressedScene, written: CompressedScene) -> dict[str, float]:
-    """Root mean square errors over the splats, by quantity.
-
-    Args:
-        read: What the file holds, N splats.
-        written: What it was written from, the same splats in the same order; spherical-harmonic coefficients that
-            the file does not hold count as 0.
-
-    Returns:
-        ``position`` in scene units, ``rotation`` in degrees, ``log-scale``, ``opacity`` in [0, 1], and the coefficients
-        ``sh0`` and ``shN``; 0 where there is nothing to compare.
-    """
-    sums = defaultdict[str, float](float)
-    for one, other in zip(read.parts(), written.parts(), strict=True):
-        for name, error in _differences(one.with_degree(written.sh_degree), other).items():
-            sums[name] += float(np.square(error).sum()) / max(1, math.prod(error.shape[1:]) * len(written))
-    return {name: math.sqrt(total) for name, total in sums.items()}
-
-
-def _differences(read: CompressedScene, written: CompressedScene) -> dict[str, Arrays]:
-    """Differences ``[N, ...]`` of the same splats, as :func:`attribute_errors` names them."""
-    units = unit(read.rows("quats"))
-    others = unit(written.rows("quats"))
-    nearer = np.minimum(np.linalg.norm(units - others, axis=1), np.linalg.norm(units + others, axis=1))
-
-    def difference(name: str) -> Arrays:
-        return read.rows(name) - written.rows(name).astype(np.float64)
-
-    return {
-        "position": difference("means"),
-        "rotation": np.degrees(4 * np.arcsin(np.minimum(nearer / 2, 1))),
-        "log-scale": difference("scales"),
-        "opacity": opacity_of(read.opacities) - opacity_of(written.opacities),
-        "sh0": difference("sh0"),
-        "shN": difference("shN"),
-    }

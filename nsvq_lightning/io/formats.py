@@ -33,15 +33,12 @@ class Format:
         write: ``write(path, scene, **options) -> bytes written``; None if it is only read.
         native: Whether it is our own: it holds the origin that positions are relative to, and ``write`` has an option
             ``storage``, the level and precision.
-        in_order: Gives the splats of a scene that a file holds, in file order, for comparison with what is read back;
-            None if the format loses nothing, or states its errors itself.
     """
 
     description: str
     read: Callable[[Path], CompressedScene]
     write: Callable[..., int] | None
     native: bool = False
-    in_order: Callable[[CompressedScene], CompressedScene] | None = None
 
 
 def load(path: StrPath) -> "Splats":
@@ -167,21 +164,12 @@ _WAYS = {
 FORMATS = {
     ".ply": Format("3D Gaussian Splatting", ply.read_ply, ply.write_ply),
     ".nsvq": Format("compressed scene of this package", read_nsvq, write_nsvq, native=True),
-    ".sog": Format("PlayCanvas, SuperSplat", sog.read_sog, sog.write_sog, in_order=CompressedScene.in_morton_order),
-    ".spz": Format("Niantic", spz.read_spz, spz.write_spz, in_order=spz.in_spz_order),
+    ".sog": Format("PlayCanvas, SuperSplat", sog.read_sog, sog.write_sog),
+    ".spz": Format("Niantic", spz.read_spz, spz.write_spz),
     ".glb": Format("glTF, KHR_gaussian_splatting", glb.read_glb, glb.write_glb),
     ".usda": Format("OpenUSD, for scenes of moderate size", usda.read_usda, usda.write_usda),
-    ".compressed.ply": Format(
-        "PlayCanvas, SuperSplat", ply.read_ply, ply.write_compressed_ply, in_order=CompressedScene.in_morton_order
-    ),
-    lod.NAME: Format(
-        "streamed SOG, a folder with levels of detail", lod.read_lod, lod.write_lod, in_order=lod.in_lod_order
-    ),
+    ".compressed.ply": Format("PlayCanvas, SuperSplat", ply.read_ply, ply.write_compressed_ply),
+    lod.NAME: Format("streamed SOG, a folder with levels of detail", lod.read_lod, lod.write_lod),
     sog.META: Format("SOG as a folder", sog.read_sog, None),
-    ".splat": Format(
-        "first viewers on the web, without spherical harmonics",
-        splat.read_splat,
-        splat.write_splat,
-        in_order=lambda scene: scene,
-    ),
+    ".splat": Format("first viewers on the web, without spherical harmonics", splat.read_splat, splat.write_splat),
 }

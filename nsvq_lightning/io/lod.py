@@ -91,12 +91,6 @@ def write_lod(
     return total + len(index)
 
 
-def in_lod_order(scene: CompressedScene) -> CompressedScene:
-    """The splats in the order of a file's finest level: leaf by leaf, in Morton order in each."""
-    _, leaves = _tree([scene])
-    return scene.take(np.concatenate([rows[0] for rows, _ in leaves]))
-
-
 def _tree(levels: Sequence[CompressedScene]) -> tuple[Json, list[tuple[list[Integers], Json]]]:
     """The root, and in their order the leaves with the splats of each level in them."""
     from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
