@@ -16,6 +16,7 @@ from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
 from nsvq_lightning.io.numbers import FLAT, Clamped, finite_logits, finite_logs, logits_of, opacity_of
+from nsvq_lightning.io.placing import FAR
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
 from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s
@@ -146,6 +147,8 @@ def _parsed(file: BinaryIO) -> PlyHeader:
                 antialiased = mode == "mip"
             case ["comment", "antialiased", number]:
                 antialiased = number == "1"
+            case ["comment", "vertical", "axis:", "z"]:  # nerfstudio's
+                log.info("%s: z is up there; to turn it: nsvq convert --up minus-y --up-from 0 0 1", file.name)
     return replace(elements.pop("vertex"), antialiased=antialiased, others=elements)
 
 
@@ -283,10 +286,11 @@ def read_ply(path: StrPath) -> CompressedScene:
     """Read the splats of a ``.ply`` file.
 
     Properties may come in any order and any number type, binary (either byte order) or ascii; with or without normals.
-    The number of ``f_rest`` properties gives the SH degree, 0 to 3; other properties and elements are skipped. Discs
-    (a third scale of -inf, or none) get the thickness :data:`~nsvq_lightning.io.numbers.FLAT`; ``red green blue`` stand
-    in for ``f_dc_0`` to 2. The widths ``filter_3D`` of Mip-Splatting (Yu et al. 2024) are added to those of the splats,
-    √(σ² + f²), and opacities fall by as much as these grow. A compressed ``.ply`` of PlayCanvas is known by its header.
+    The number of ``f_rest`` properties gives the SH degree, 0 to 3; other properties and elements are skipped. Discs (a
+    third scale of -inf, or none) get the thickness :data:`~nsvq_lightning.io.numbers.FLAT`; ``red green blue`` stand in
+    for ``f_dc_0`` to 2. Doubles far from 0, as on a map, become relative to an origin. The widths ``filter_3D`` of
+    Mip-Splatting (Yu et al. 2024) are added to those of the splats, √(σ² + f²), and opacities fall by as much as these
+    grow. A compressed ``.ply`` of PlayCanvas is known by its header.
 
     Raises:
         FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.
@@ -294,8 +298,20 @@ def read_ply(path: StrPath) -> CompressedScene:
     header = read_ply_header(path)
     with naming_file(path):
         sh_degree = splat_degree(header)
-    read = _read_packed if header.packed else _read_plain
-    return CompressedScene.from_rows(read(path, header, sh_degree), antialiased=header.antialiased)
+    rows = (_read_packed if header.packed else _read_plain)(path, header, sh_degree)
+    means, origin = _near(rows["means"])
+    return CompressedScene.from_rows({**rows, "means": means}, header.antialiased, origin=origin)
+
+
+def _near(means: Arrays) -> tuple[Arrays, tuple[float, float, float]]:
+    """Positions ``[N, 3]`` relative to an origin, which is their middle if that is too far away for float32."""
+    if means.dtype == np.float64 and len(finite := means[np.isfinite(means).all(1)]):
+        from nsvq_lightning.rendering.frame import middle_of  # imports torch
+
+        middle, usual = middle_of(finite)
+        if np.linalg.norm(middle) > FAR * usual:
+            return means - middle, tuple(middle.tolist())
+    return means, (0.0, 0.0, 0.0)
 
 
 def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, Arrays]:
@@ -303,9 +319,11 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
     columns = _needed(header, sh_degree)
     # A third scale that is not there stays flat.
     rows = {name: np.full((header.count, dim), FLAT, np.float32) for name, dim in attribute_dims(sh_degree).items()}
+    kind = np.float64 if header.dtype["x"].itemsize == 8 else np.float32  # of positions on a map
+    rows["means"] = rows["means"].astype(kind)
     ends = np.cumsum([len(names) for names in columns.values()])
     start = 0
-    for table in read_ply_columns(path, header, [*chain(*columns.values())]):
+    for table in read_ply_columns(path, header, [*chain(*columns.values())], kind):
         for name, part in zip(columns, np.split(table, ends[:-1], axis=1), strict=True):
             rows[name][start : start + len(table), : part.shape[1]] = part
         start += len(table)

@@ -305,7 +305,7 @@ def _palette(scene: CompressedScene, most: int) -> tuple[Float32s, Int64s]:
     if "shN" not in scene.codes:
         return in_order_of_use(*find_palette(scene.rows("shN"), _visibility(scene), most))
     rows, codes = in_order_of_use(scene.codebooks["shN"], scene.codes["shN"])
-    if len(rows) <= PALETTE_LIMIT:
+    if len(rows) <= most:
         return rows, codes
     rows, labels = find_palette(rows, np.bincount(codes, _visibility(scene)), most)
     return in_order_of_use(rows, labels[codes])

@@ -356,7 +356,7 @@ def _fraction_bits(scene: CompressedScene) -> int:
     # No coordinate is off by more than a twentieth of the splat's size, but for the smallest thousandth of the splats.
     needed = math.ceil(-(math.log2(2 * 0.05) + float(np.quantile(sizes, 0.001)) / math.log(2)))
     reach = np.abs(scene.means).max(1)
-    fits, mostly_fits = (_POSITION - 1 - math.frexp(end)[1] for end in (reach.max(), np.quantile(reach, 0.999)))
+    fits, mostly_fits = (_POSITION - 1 - math.frexp(end)[1] for end in (reach.max(), np.quantile(reach, 0.99)))
     return min(max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0), MAX_FRACTION)
 
 

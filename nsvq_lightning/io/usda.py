@@ -88,6 +88,8 @@ def read_usda(path: StrPath) -> CompressedScene:
         own = [prim for prim in prims if re.match(rf"{PRIM}\b", prim)]
         if len(own) != 1:
             raise FormatError(f"{len(own)} prims of the kind {PRIM}, not one", "export it anew with one")
+        if b"lin_rec709" in data:
+            log.warning("%s: colours are linear light and are shown as they are, too dark", path)
         if "xformOp:" in text:
             raise FormatError("it has transforms (xformOp), which are not read", "export it anew, flattened")
         prim = own[0]

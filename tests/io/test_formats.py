@@ -4,6 +4,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import compressed_scenes
 import numpy as np
 import pytest
 import torch
@@ -48,6 +49,10 @@ def test_attributes_by_name_are_saved_as_they_come(tmp_path: Path) -> None:
 def test_options_reach_the_format(tmp_path: Path) -> None:
     splats = scene(200, 3)
     assert save(splats, tmp_path / "few.sog", palette=8) < save(splats, tmp_path / "all.sog")
+    coded = compressed_scenes.scene(200, {"shN": 64})
+    for palette, rows in ((8, 8), (64, len(np.unique(coded.codes["shN"])))):
+        save(coded, tmp_path / "coded.sog", palette=palette)
+        assert len(read_scene(tmp_path / "coded.sog").codebooks["shN"]) == rows
     with pytest.raises(TypeError, match="palette"):
         save(splats, tmp_path / "x.nsvq", palette=8)
     save(splats, tmp_path / "paper.nsvq", storage="paper")

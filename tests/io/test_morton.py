@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from viewer_scenes import plain_scene
 
+from nsvq_lightning.io import CompressedScene, read_scene, save
 from nsvq_lightning.io.morton import AXIS_BITS, Grid, morton_keys, nearest_before, spatial_order, unmorton
 
 
@@ -73,6 +78,22 @@ def test_splats_in_spatial_order_are_near_the_one_before() -> None:
         assert sorted(order) == list(range(4000))
         steps = np.linalg.norm(np.diff(each[order], axis=0), axis=1)
         assert np.quantile(steps, 0.95) < 10  # in random order 39
+
+
+def test_lost_splats_are_the_last(tmp_path: Path) -> None:
+    """So they stretch no bounds of others: chunks of 256 in a compressed .ply."""
+    scene = plain_scene(4000, 0)
+    near = _errors(scene, tmp_path / "a.compressed.ply")
+    scene.means[::100] *= 1e5
+    far = _errors(scene, tmp_path / "b.compressed.ply")
+    assert {*spatial_order(scene.means)[-40:] % 100} == {0}
+    assert far[: 4000 // 256 * 256 - 256].max() < 3 * near.max()
+
+
+def _errors(scene: CompressedScene, path: Path) -> NDArray[np.float32]:
+    """How far splats are from where they were, in the order of the file."""
+    save(scene, path)
+    return np.linalg.norm(read_scene(path).means - scene.in_morton_order().means, axis=1)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 400])

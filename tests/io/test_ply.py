@@ -221,6 +221,31 @@ def test_names_with_the_prefix_of_a_point_cloud_editor_are_known(tmp_path: Path)
     assert_same(_changed(tmp_path / "x.ply", splats, *changes), splats)
 
 
+@pytest.mark.parametrize("encoding", ["binary_little_endian", "ascii"])
+def test_doubles_on_a_map_keep_their_detail(tmp_path: Path, encoding: str) -> None:
+    """As CloudCompare writes them where it has shifted a scene."""
+    splats = scene(60, 0)
+    place = np.array([5e5, 4.1e6, 120.0])
+    names = _names(0)
+    values = np.array([[*_values(splats, row).values()] for row in range(60)])
+    values[:, :3] += place
+    kinds = ["double" if name in "xyz" else "float" for name in names]
+    rows = np.rec.fromarrays([*values.T], ",".join("<f8" if kind == "double" else "<f4" for kind in kinds))
+    lines = "\n".join(" ".join(map(repr, row)) for row in values.tolist())
+    head = _header([f"{kind} {name}" for kind, name in zip(kinds, names, strict=True)], 60, encoding)
+    (tmp_path / "x.ply").write_bytes(head + (rows.tobytes() if encoding != "ascii" else lines.encode()))
+    read = read_ply(tmp_path / "x.ply")
+    np.testing.assert_allclose(read.means.astype(float) + read.origin, splats.means + place, rtol=0, atol=1e-6)
+    assert np.abs(read.means).max() < 10
+
+
+def test_z_that_is_up_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    for axis in "yz":
+        _changed(tmp_path / "x.ply", scene(4, 0), (b"element", b"comment Vertical Axis: %s\nelement" % axis.encode()))
+        assert ("--up minus-y --up-from 0 0 1" in caplog.text) == (axis == "z")
+
+
 def test_discs_are_read_with_next_to_no_thickness(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     splats = scene(5, 0)
     columns = {name: np.array([_values(splats, row)[name] for row in range(5)], "<f4") for name in _names(0)}

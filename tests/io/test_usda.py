@@ -98,6 +98,13 @@ def test_the_same_splats_in_other_words(
     assert ("changes with time" in caplog.text) == (change is _sampled)
 
 
+def test_linear_light_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    _changed(
+        tmp_path / "x.usda", lambda text: text.replace("(", '(\n    customData = { string c = "lin_rec709_scene" }', 1)
+    )
+    assert "linear light" in caplog.text
+
+
 def test_axes_and_unit_of_the_stage(tmp_path: Path) -> None:
     """Oracle: by hand. With z up, y points away; ours points down, and away is z."""
     plain = _changed(tmp_path / "x.usda", str)
