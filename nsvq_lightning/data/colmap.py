@@ -259,12 +259,14 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
     points = tables.PointTable(np.zeros((0, 3)), np.zeros((0, 3)), ())
     if "points3D" in files:
         points = _table(files["points3D"], lambda path: tables.read_points(path, observations))
+    around = files["images"].relative_to(root).parents[:-1]  # photos beside a model lie in the folder that holds both
     return ColmapModel(
         images=tuple(ColmapImage(row.name, row.camera_id, view) for row, view in zip(rows, viewmats, strict=True)),
         cameras={row.camera_id: _camera(cameras[row.camera_id], files["cameras"]) for row in rows},
         points=points.xyz,
         colors=rgb_bytes(points.rgb),
         observations=_observations(rows, points.tracks) if observations else None,
+        images_folder=next((str(each / "images") for each in around if (root / each / "images").is_dir()), None),
     )
 
 

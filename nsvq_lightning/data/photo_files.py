@@ -5,6 +5,7 @@ import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from glob import glob
 from pathlib import Path, PurePosixPath
 
 from nsvq_lightning.data.colmap import ColmapImage, NoPhotosError, SceneError, check_name, is_outside
@@ -118,9 +119,10 @@ def _kind(name: str) -> str:
     return name.lower().rpartition(".")[2].replace("jpeg", "jpg").replace("tiff", "tif")
 
 
-def photos_below(folder: Path) -> list[Path]:
-    """The files in a folder and the folders in it that end as photos do, sorted."""
-    return sorted(path for path in folder.rglob("*") if path.suffix.lower() in PHOTOS and path.is_file())
+def photos_below(folder: Path, suffixes: Sequence[str] = PHOTOS) -> list[Path]:
+    """The files in a folder and the folders in it, linked ones too, that end as photos do, sorted."""
+    found = map(folder.joinpath, glob("**", root_dir=folder, recursive=True, include_hidden=True))
+    return sorted(path for path in found if path.suffix.lower() in suffixes and path.is_file())
 
 
 def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]) -> tuple[Path, int]:
@@ -180,7 +182,7 @@ def find_masks(
         raise SceneError(f"{len(lost)} masks do not exist, first {lost[0]}: copy them, or remove mask_path")
     relative = [str(path.relative_to(photos)) if path.is_relative_to(photos) else path.name for path in files]
     named = [(image.name, name) for image, name in zip(images, relative, strict=True)]
-    has_own = any(given)
+    has_own = any(given) and folders[-1] == "masks"  # another folder is meant in their place
     usual = [root / name for name in folders if (root / name).is_dir()][:1]
     places = usual
     if not usual and not has_own and folders[-1] == "masks":
@@ -193,7 +195,8 @@ def find_masks(
         if not usual:
             log.info("masks are read from %s", shown)
         (masks,) = found.values()
-        return [own or other for own, other in zip(given, masks, strict=True)]
+        choice = zip(given, masks, strict=True) if has_own else zip(masks, given, strict=True)
+        return [first or second for first, second in choice]
     if found:
         log.warning("masks in %s are not used: choose a folder (--data.masks)", shown)
     elif usual and not has_own:

@@ -27,7 +27,7 @@ from PIL.ExifTags import IFD, Base
 
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
 from nsvq_lightning.data.images import DAMAGED, ImageHead, read_image
-from nsvq_lightning.data.photo_files import PHOTOS
+from nsvq_lightning.data.photo_files import PHOTOS, photos_below
 from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
 
 # Photos that are named; of the others, their number is.
@@ -357,7 +357,7 @@ def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
         SceneError: There are none.
     """
     suffixes = PHOTOS + CONVERTED + RAW
-    files = [path for path in folder.rglob("[!.]*") if path.suffix.lower() in suffixes and path.is_file()]
+    files = [path for path in photos_below(folder, suffixes) if not path.name.startswith(".")]
     files.sort(key=lambda path: (path.parent != folder, suffixes.index(path.suffix.lower()), path))
     taken: dict[str, Path] = {}
     left = defaultdict(list)

@@ -249,7 +249,9 @@ def load_scene(
             f"test views; at least 1 of each is needed: {advice}"
         )
     names = [image.name for image in poses.images]
-    folder, divisor = photo_folder(root, poses.images_folder or images_folder, factor, names)
+    if images_folder == "images":
+        images_folder = poses.images_folder or images_folder
+    folder, divisor = photo_folder(root, images_folder, factor, names)
     found = locate(names, folder, f"the {poses.source} model of {root}", allow_outside)
     files = [found[name] for name in names]
     lost = [name for name in names if not found[name].is_file()]
@@ -279,11 +281,14 @@ def load_scene(
     if not usable.all():
         text = "left out %d of %d points: they are at the centre of a camera, or far from all others"
         log.warning(text, len(usable) - usable.sum(), len(usable))
+    images = ImageStore(sources, cache_bytes)
+    # Opaque photos of such scenes have black or white behind their objects, as their first row tells.
+    transparent = any(source.has_alpha for source in sources)
     return Scene(
         root=root,
         names=tuple(names),
         cameras=cameras,
-        images=ImageStore(sources, cache_bytes),
+        images=images,
         points=torch.from_numpy(poses.points[usable]).float(),
         colors=torch.from_numpy(poses.colors[usable]).float() / 255,
         train=train,
@@ -291,7 +296,7 @@ def load_scene(
         extent=extent,
         frame=frame,
         split=split,
-        white=poses.synthetic,
+        white=poses.synthetic and (transparent or float(images[0].image[0].float().mean()) > 127),
     )
 
 

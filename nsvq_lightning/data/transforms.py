@@ -246,14 +246,14 @@ def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> Colm
         number = numbers.setdefault(frame.lens(), len(numbers) + 1)
         images.append(ColmapImage(name.removeprefix(f"{folder}/"), number, frame.viewmat(), frame.mask))
     cameras = {number: colmap.lens(number, *lens) for lens, number in numbers.items()}
-    points, colors = _points(root, head, images, cameras, allow_outside)
+    points, colors = _points(files[0].parent, head, images, cameras, allow_outside)
     return ColmapModel(
         images=tuple(images),
         cameras=cameras,
         points=points,
         colors=colors,
         source=files[0].name,
-        images_folder=folder,
+        images_folder=str((files[0].parent / folder).relative_to(root)),
         test=tuple(row for row, name in enumerate(names) if name in test) if is_split else None,
         synthetic=files[0].name == "transforms_train.json",
     )

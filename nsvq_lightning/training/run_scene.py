@@ -172,8 +172,7 @@ def background_of(scene: Scene, asked: str) -> str:
     """
     if scene.white and asked not in ("auto", "white"):
         raise ValueError(
-            f"the photos of {scene.root} are transparent around their objects and are shown on white, "
-            f"model.background is {asked}: leave it at auto"
+            f"the photos of {scene.root} are white around their objects, model.background is {asked}: leave it at auto"
         )
     if asked != "auto":
         return asked

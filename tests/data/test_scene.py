@@ -22,6 +22,7 @@ from transforms_scenes import write_blender, write_nerfstudio
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_models
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.images import ImageHead
+from nsvq_lightning.data.photo_files import photos_below
 from nsvq_lightning.data.reconstruct import reconstruct
 from nsvq_lightning.data.scene import load_scene, spread, usable
 from nsvq_lightning.training.module import SplatModule
@@ -443,8 +444,77 @@ def test_scenes_of_nerf_synthetic_are_in_front_of_white(demo_scene: Path, tmp_pa
     module, data = SplatModule(sh_degree=0, codebooks=None), ColmapDataModule(str(root))
     trainer.fit(module, data)
     assert module.background == "white"
-    with pytest.raises(ValueError, match=r"shown on white, model\.background is black: leave it at auto"):
+    with pytest.raises(ValueError, match=r"white around their objects, model\.background is black: leave it at auto"):
         trainer.fit(SplatModule(sh_degree=0, codebooks=None, background="black"), ColmapDataModule(str(root)))
+
+
+@pytest.mark.parametrize(("behind", "white"), [(0, False), (255, True)])
+def test_opaque_photos_of_such_scenes_have_the_background_that_they_show(
+    demo_scene: Path, tmp_path: Path, behind: int, white: bool
+) -> None:
+    root = write_blender(demo_scene, tmp_path / "lego")
+    for path in root.glob("*/*.png"):
+        photo = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        photo[photo[..., 3] == 0] = behind
+        photo[:2] = behind
+        assert cv2.imwrite(str(path), photo[..., :3])
+    scene = load_scene(root)
+    assert scene.white == white
+    assert (scene.view(4).image[:, :24] == behind).all()
+
+
+def test_photos_of_a_model_inside_are_those_beside_it(demo_scene: Path, tmp_path: Path) -> None:
+    root = tmp_path / "scene"
+    shutil.copytree(demo_scene, root / "dense")
+    shutil.copytree(demo_scene / "images", root / "images")
+    for path in (root / "images").iterdir():
+        path.write_bytes(cv2.imencode(path.suffix, 255 - cv2.imread(str(path)))[1].tobytes())
+    expected = load_scene(demo_scene).view(2).image
+    for model in (None, "dense/sparse/0"):
+        assert torch.equal(load_scene(root, model=model).view(2).image, expected)
+    shutil.copytree(demo_scene / "sparse", root / "sparse")
+    assert not torch.equal(load_scene(root).view(2).image, expected)
+
+
+def test_what_a_transforms_file_inside_names_lies_beside_it(demo_scene: Path, tmp_path: Path) -> None:
+    root = tmp_path / "scene"
+    inside = write_nerfstudio(demo_scene, root / "export")
+    shutil.copytree(inside / "images", root / "images")
+    for path in (root / "images").iterdir():
+        path.write_bytes(cv2.imencode(path.suffix, 255 - cv2.imread(str(path)))[1].tobytes())
+    scene, expected = load_scene(root, model="export/transforms.json"), load_scene(inside)
+    assert torch.equal(scene.view(2).image, expected.view(2).image)
+    assert torch.equal(scene.points, expected.points)
+    other = load_scene(root, model="export/transforms.json", images_folder="./images")
+    assert not torch.equal(other.view(2).image, expected.view(2).image)
+
+
+def test_a_folder_of_masks_that_is_asked_for_counts_before_those_named(demo_scene: Path, tmp_path: Path) -> None:
+    root = write_nerfstudio(demo_scene, tmp_path / "scene")
+    document = json.loads((root / "transforms.json").read_text())
+    for name, rows in (("named", 10), ("asked", 20)):
+        mask = np.full((72, 96), 255, np.uint8)
+        mask[:rows] = 0
+        for frame in document["frames"]:
+            path = root / name / Path(frame["file_path"]).with_suffix(".png").name
+            path.parent.mkdir(exist_ok=True)
+            assert cv2.imwrite(str(path), mask)
+            frame["mask_path"] = f"named/{path.name}"
+    (root / "transforms.json").write_text(json.dumps(document))
+    for masks, rows in (("masks", 10), ("asked", 20)):
+        assert int((~load_scene(root, masks=masks).view(1).mask).sum()) == rows * 96
+
+
+def test_folders_that_are_links_are_searched(demo_scene: Path, tmp_path: Path) -> None:
+    root = tmp_path / "scene"
+    shutil.copytree(demo_scene, root)
+    (tmp_path / "elsewhere").mkdir()
+    for path in (root / "images").iterdir():
+        assert cv2.imwrite(str(tmp_path / "elsewhere" / f"{path.stem}.png"), np.eye(72, 96, dtype=np.uint8))
+    (root / "masks").mkdir()
+    (root / "masks" / "all").symlink_to(tmp_path / "elsewhere")
+    names = [path.name for path in photos_below(root / "masks")]
+    assert names == sorted(path.name for path in (tmp_path / "elsewhere").iterdir())
 
 
 def test_masks_that_a_transforms_file_names(demo_scene: Path, tmp_path: Path) -> None:
