@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
     file = scene_file(options.scene)
     output = options.output or file.with_name("render.mp4")
     is_video = output.suffix.lower() == VIDEO
-    if output.suffix and not is_video:
+    if output.suffix and not is_video and not output.is_dir():
         raise ValueError(f"{output}: name a video ({VIDEO}), or a folder for PNGs")
     scene, known, _ = scene_with_views(read_scene(file), file, options.root)
     splats = scene.decode()

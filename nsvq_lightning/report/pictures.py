@@ -156,7 +156,7 @@ def frame_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
         height: Pixels.
         fps: Frames per second.
     """
-    if path.suffix:
+    if path.suffix and not path.is_dir():
         make_folder_of(path)
         with video_writer(path, width, height, fps) as add:
             yield lambda picture: add(as_bytes(picture))
