@@ -8,7 +8,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Sequence, Sized
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path, PurePath
 from typing import Any, ClassVar, TypeVar
 
@@ -109,7 +109,7 @@ class ColmapModel:
         colors: Their colours ``[P, 3]`` uint8 RGB.
         observations: Row of the point and row of the image of each sighting ``[O, 2]`` int64; None unless requested.
         source: Where it comes from, for messages.
-        images_folder: Folder of the photos inside the scene folder, where the model says so.
+        images_folder: Folder of the photos, where the model says so.
         test: Rows of the test images, where the model says so.
         synthetic: Whether it is a NeRF-synthetic scene, whose transparent pixels are white by convention.
     """
@@ -259,14 +259,15 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
     points = tables.PointTable(np.zeros((0, 3)), np.zeros((0, 3)), ())
     if "points3D" in files:
         points = _table(files["points3D"], lambda path: tables.read_points(path, observations))
-    around = files["images"].relative_to(root).parents[:-1]  # photos beside a model lie in the folder that holds both
+    # Photos beside a model deeper in the folder.
+    beside = [each / "images" for each in takewhile(root.__ne__, files["images"].parents[:3])]
     return ColmapModel(
         images=tuple(ColmapImage(row.name, row.camera_id, view) for row, view in zip(rows, viewmats, strict=True)),
         cameras={row.camera_id: _camera(cameras[row.camera_id], files["cameras"]) for row in rows},
         points=points.xyz,
         colors=rgb_bytes(points.rgb),
         observations=_observations(rows, points.tracks) if observations else None,
-        images_folder=next((str(each / "images") for each in around if (root / each / "images").is_dir()), None),
+        images_folder=next((str(each.absolute()) for each in beside if each.is_dir()), None),
     )
 
 

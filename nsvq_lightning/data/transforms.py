@@ -253,7 +253,7 @@ def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> Colm
         points=points,
         colors=colors,
         source=files[0].name,
-        images_folder=str((files[0].parent / folder).relative_to(root)),
+        images_folder=str((files[0].parent / folder).absolute()),
         test=tuple(row for row, name in enumerate(names) if name in test) if is_split else None,
         synthetic=files[0].name == "transforms_train.json",
     )

@@ -470,7 +470,7 @@ def test_photos_of_a_model_inside_are_those_beside_it(demo_scene: Path, tmp_path
     for path in (root / "images").iterdir():
         path.write_bytes(cv2.imencode(path.suffix, 255 - cv2.imread(str(path)))[1].tobytes())
     expected = load_scene(demo_scene).view(2).image
-    for model in (None, "dense/sparse/0"):
+    for model in (None, "dense/sparse/0", str(root / "dense" / "sparse" / "0")):
         assert torch.equal(load_scene(root, model=model).view(2).image, expected)
     shutil.copytree(demo_scene / "sparse", root / "sparse")
     assert not torch.equal(load_scene(root).view(2).image, expected)
@@ -482,7 +482,7 @@ def test_what_a_transforms_file_inside_names_lies_beside_it(demo_scene: Path, tm
     shutil.copytree(inside / "images", root / "images")
     for path in (root / "images").iterdir():
         path.write_bytes(cv2.imencode(path.suffix, 255 - cv2.imread(str(path)))[1].tobytes())
-    scene, expected = load_scene(root, model="export/transforms.json"), load_scene(inside)
+    scene, expected = load_scene(root, model=str(inside / "transforms.json")), load_scene(inside)
     assert torch.equal(scene.view(2).image, expected.view(2).image)
     assert torch.equal(scene.points, expected.points)
     other = load_scene(root, model="export/transforms.json", images_folder="./images")
