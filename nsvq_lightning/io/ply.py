@@ -148,7 +148,8 @@ def _parsed(file: BinaryIO) -> PlyHeader:
             case ["comment", "antialiased", number]:
                 antialiased = number == "1"
             case ["comment", "vertical", "axis:", "z"]:  # nerfstudio's
-                log.info("%s: z is up there; to turn it: nsvq convert --up minus-y --up-from 0 0 1", file.name)
+                about = "z is up, and cameras of a transforms.json beside it may be in another frame"
+                log.info("%s: %s; to turn it: nsvq convert --up minus-y --up-from 0 0 1", file.name, about)
     return replace(elements.pop("vertex"), antialiased=antialiased, others=elements)
 
 

@@ -20,8 +20,6 @@ from nsvq_lightning.splats.conventions import Float64s
 
 # File beside the scene of a run, or of INRIA's trainer, or two folders above it.
 CAMERAS = "cameras.json"
-# The lens of a camera in JSON files, in pixels.
-LENS = ("fx", "fy", "cx", "cy")
 
 
 def reframed(camera: Camera, width: int, height: int) -> Camera:
@@ -192,9 +190,7 @@ def read_cameras(path: Path) -> dict[str, Camera]:
             width, height = int(entry["width"]), int(entry["height"])
             if max(width, height) > _MAX_SIDE:
                 raise ValueError(f"a picture of {width}x{height}")
-            lens = [
-                entry.get(key, middle) for key, middle in zip(LENS, (None, None, width / 2, height / 2), strict=True)
-            ]
+            lens = entry["fx"], entry["fy"], entry.get("cx", width / 2), entry.get("cy", height / 2)
             name = str(entry["img_name"])
             if name in cameras:  # the names of photos in several folders, without these
                 name = f"{name} ({entry['id']})"

@@ -18,7 +18,6 @@ from nsvq_lightning.io.atomic import StrPath, write_text
 from nsvq_lightning.io.errors import Json
 from nsvq_lightning.io.nsvq.file import read_nsvq
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.camera_paths import LENS
 from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.splats.splats import SplatTensors
 
@@ -134,7 +133,7 @@ def camera_entry(camera: Camera) -> Json:
 
 def lens_entry(camera: Camera) -> dict[str, float]:
     """Width, height, focal lengths and principal point of a camera in pixels, as JSON files have them."""
-    lens = dict(zip(LENS, camera.intrinsics, strict=True))
+    lens = dict(zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True))
     return {"width": int(camera.width), "height": int(camera.height), **lens}
 
 
