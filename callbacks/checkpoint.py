@@ -3,6 +3,7 @@
 import logging
 import signal
 import threading
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -12,6 +13,7 @@ import torch
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
+from nsvq_lightning.io.atomic import atomic_path, make_folder_of
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
@@ -200,7 +202,15 @@ class RunCheckpoint(WritingCallback, Checkpoint):
             return
         folder = run_folder(trainer) / "checkpoints"
         with module.stopwatch.paused(module.device):
-            for name in (f"step-{trainer.global_step}", "last")[not self.keep :]:
-                # weights_only=False here: save the optimiser's state too. The file holds plain data all the same.
-                trainer.save_checkpoint(folder / f"{name}.ckpt", weights_only=False)
+            if self.keep:
+                _write(trainer, folder / f"step-{trainer.global_step}.ckpt")
+            _write(trainer, folder / "last.ckpt")
         self.best_model_path, self._saved = str(folder / "last.ckpt"), trainer.global_step
+
+
+def _write(trainer: Trainer, path: Path) -> None:
+    """Write a checkpoint in one step; other trainers than ours write where the system has temporary files, and move."""
+    # weights_only=False here: save the optimiser's state too. The file holds plain data all the same.
+    make_folder_of(path)
+    with atomic_path(path) if trainer.is_global_zero else nullcontext(path) as target:
+        trainer.save_checkpoint(target, weights_only=False)
