@@ -53,7 +53,7 @@ def test_the_background_is_that_of_the_photos(white: bool, asked: str, found: st
 def test_transparent_photos_are_not_trained_on_black() -> None:
     scene: Any = SimpleNamespace(white=True, root="lego")
     for asked in ("black", "random"):
-        with pytest.raises(ValueError, match=f"lego are transparent .* model.background is {asked}: leave it at auto"):
+        with pytest.raises(ValueError, match=f"lego are white .* model.background is {asked}: leave it at auto"):
             background_of(scene, asked)
 
 
