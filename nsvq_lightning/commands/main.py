@@ -37,8 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0, 1 after an error in the user's files, 130 after Ctrl-C, 143 after SIGTERM. Wrong arguments end
         the process with status 2.
     """
-    home = os.path.expanduser("~")  # which no shell puts into --output=~/scene.ply
-    arguments = [text.replace("=~/", f"={home}/") for text in (sys.argv[1:] if argv is None else argv)]
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    arguments = [text.replace("=~/", f"={os.path.expanduser('~')}/") for text in arguments]  # no shell does
     name = arguments[0] if arguments else ""
     if name in ("", "--help", "-h", "help"):
         sys.stdout.write(overview())

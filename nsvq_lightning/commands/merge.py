@@ -29,6 +29,7 @@ def run(options: argparse.Namespace) -> int:
     from nsvq_lightning.data.scene import load_scene
     from nsvq_lightning.io.compressed import CompressedScene, on_white, renderer
     from nsvq_lightning.io.formats import format_of, read_scene, save
+    from nsvq_lightning.rendering.frame import ZERO
     from nsvq_lightning.report.numbers import evaluate
 
     format_of(options.output)
@@ -50,8 +51,8 @@ def run(options: argparse.Namespace) -> int:
         say(f"{folder}: {len(part):,} of {len(whole):,} splats are in its core")
         parts.append(part)
     photos = load_scene(blocks[0].scene, **blocks[0].options)
-    # Parts have the coordinates of the whole's files, whose origin only the whole knows.
-    scene = replace(CompressedScene.joined(parts), origin=photos.frame.origin)
+    # Parts have the coordinates of the whole's files, whose origin only the whole knows, or are relative to one there.
+    scene = replace(CompressedScene.joined(parts).relative_to(ZERO), origin=photos.frame.origin)
     size = save(scene, options.output)
     say(f"{options.output}: {len(scene):,} splats in {size:,} bytes")
     look = renderer(on_white(scene) if photos.white else scene)

@@ -122,7 +122,7 @@ def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
     scene = options.scene
     record = {"source": str(options.source.resolve()), "max_size": options.max_size}
     if is_video:
-        record["frames"] = options.frames
+        record["frames"] = [options.frames, options.source.stat().st_size]
     path = scene / reconstruct.RECORD
     if not path.is_file():
         own = {"images"} if in_place else set()

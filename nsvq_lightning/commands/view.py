@@ -96,8 +96,8 @@ def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
     from nsvq_lightning.io.nsvq.precision import Storage
 
     file = options.scene / "scene.nsvq" if options.live else scene_file(options.scene)
-    is_ours = file.suffix.lower() == ".nsvq"
-    if options.live or (is_ours and (options.root is None or read_header(file).cameras)):
+    # What has no cameras gets those of --data.root.
+    if options.live or (file.suffix.lower() == ".nsvq" and (options.root is None or read_header(file).cameras)):
         yield file
         return
     with tempfile.TemporaryDirectory() as folder:

@@ -423,8 +423,9 @@ class Compressor:
                 trainer = SplatTrainer(max_steps=steps, callbacks=callbacks, enable_checkpointing=False)
                 trainer.fit(module, self.data)
         except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
-            if module.phase < Phase.QUANTIZE:
-                raise
+            placed = all(getattr(each, "fitted", True) for each in module.quantizers.values())
+            if module.phase < Phase.QUANTIZE or not placed:
+                raise KeyboardInterrupt
             self.stopped = True
         finally:
             chatter.setLevel(level)

@@ -431,7 +431,7 @@ def _copy(path: Path, target: Path) -> Path:
             target = target.with_suffix(suffixes[0])
         if not in_place and target.exists():
             old, new = target.stat(), path.stat()
-            if old.st_mtime == new.st_mtime and not (as_is and old.st_size != new.st_size):
+            if old.st_mtime == new.st_mtime and old.st_ctime >= new.st_ctime:  # written after it was changed
                 return target
         image.load()
         content = path.read_bytes() if as_is else _converted(image, path, kind)

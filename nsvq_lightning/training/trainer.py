@@ -52,7 +52,7 @@ class SplatTrainer(Trainer):
         if kwargs.get("accelerator", "auto") == "auto":
             kwargs["accelerator"] = best_device().type
         if kwargs["max_epochs"] not in (None, -1):
-            log.warning("max_epochs=%s ends nothing: an epoch is endless here; max_steps does", kwargs["max_epochs"])
+            log.warning("max_epochs ends nothing: an epoch is endless here; max_steps does")
         several = "view_parallel_notebook" if hasattr(sys, "ps1") else "view_parallel"
         if kwargs.get("strategy") == "view_parallel":
             kwargs["strategy"] = several

@@ -114,6 +114,23 @@ def test_ctrl_c_keeps_what_was_reached(
     assert "ended the training early" in capsys.readouterr().err
 
 
+def test_ctrl_c_before_there_are_codebooks_is_no_other_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from nsvq_lightning.callbacks import CodebookInit
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(CodebookInit, "before_step", interrupted)
+    write_ply(tmp_path / "scene.ply", ball(500))
+    output = tmp_path / "x.nsvq"
+    output.write_bytes(b"what was there")
+    assert main(["compress", str(tmp_path / "scene.ply"), str(output), "--codebooks=0.5k", "--steps=50"]) == 130
+    assert output.read_bytes() == b"what was there"
+    assert "codebook" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [("missing.ply", "missing.ply"), ("empty.ply", "no finite splat"), ("scene.ply", "100 bytes leave room for 0")],

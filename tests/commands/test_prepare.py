@@ -67,6 +67,17 @@ def test_other_options_need_a_new_beginning(photos: Path, tmp_path: Path, capsys
     assert (scene / "mine.txt").exists()
 
 
+def test_another_video_of_the_same_name_needs_a_new_beginning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    video, scene = tmp_path / "walk.mp4", tmp_path / "scene"
+    video.write_bytes(b"x")
+    assert "no frame can be read" in _fails(capsys, video, scene)
+    video.write_bytes(b"another")
+    assert "--again begins anew" in _fails(capsys, video, scene)
+    assert "no frame can be read" in _fails(capsys, video, scene, "--again")
+
+
 def test_photos_may_lie_in_their_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = tmp_path / "scene"
     (scene / "images").mkdir(parents=True)

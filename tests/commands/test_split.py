@@ -12,12 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from nsvq_lightning.commands import split
 from nsvq_lightning.commands.main import main
 from nsvq_lightning.data import blocks
 from nsvq_lightning.data.scene import load_scene
-from nsvq_lightning.io import read_scene, save
+from nsvq_lightning.io import CompressedScene, read_scene, save
+from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.splats.splats import Splats
 
 
@@ -92,6 +94,14 @@ def test_the_whole_is_what_lies_in_the_cores(demo_scene: Path, tmp_path: Path) -
     means = read_scene(tmp_path / "parts" / "1" / "run" / "scene.nsvq").means
     merged = read_scene(tmp_path / "x.ply").means
     assert sorted(map(tuple, merged.tolist())) == sorted(map(tuple, np.asarray(means).tolist()))
+    # Those far from 0 by their own size are relative to an origin.
+    for number, origin in zip("123", ((3.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, -1.0, 5.0)), strict=True):
+        path = tmp_path / "parts" / number / "run" / "scene.nsvq"
+        save(CompressedScene.from_splats(splats).relative_to(origin), path, Storage("paper"))
+    assert main(["merge", str(tmp_path / "parts"), "-o", str(tmp_path / "x.ply")]) == 0
+    merged, means = read_scene(tmp_path / "x.ply").means, splats.means.detach().numpy()
+    assert len(merged) == len(means)
+    assert cKDTree(merged).query(means)[0].max() < 1e-5
 
 
 @pytest.mark.skipif(shutil.which("xargs") is None, reason="this system has no xargs")
