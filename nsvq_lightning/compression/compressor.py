@@ -423,9 +423,8 @@ class Compressor:
                 trainer = SplatTrainer(max_steps=steps, callbacks=callbacks, enable_checkpointing=False)
                 trainer.fit(module, self.data)
         except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
-            placed = all(getattr(each, "fitted", True) for each in module.quantizers.values())
-            if module.phase < Phase.QUANTIZE or not placed:
-                raise KeyboardInterrupt
+            if module.phase < Phase.QUANTIZE or not all(getattr(q, "fitted", True) for q in module.quantizers.values()):
+                raise KeyboardInterrupt from None
             self.stopped = True
         finally:
             chatter.setLevel(level)
