@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from nsvq_lightning.commands import markdown_table, say
-from nsvq_lightning.commands.arguments import folders_beside, scene_file
+from nsvq_lightning.commands.arguments import folders_beside
 from nsvq_lightning.io.errors import Json
 from nsvq_lightning.io.formats import describe
 
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print the description of one file, without importing torch."""
-    description = describe(scene_file(options.file))
+    description = describe(options.file)
     say(json.dumps(description, indent=2, ensure_ascii=False) if options.json else _text(description))
     return 0
 

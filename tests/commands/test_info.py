@@ -85,13 +85,9 @@ def test_bad_files_are_one_line_and_status_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes
 ) -> None:
     (tmp_path / "bad.nsvq").write_bytes(content)
-    for path, start in (
-        (tmp_path / "bad.nsvq", f"{tmp_path / 'bad.nsvq'}: "),
-        (tmp_path / "missing.nsvq", "there is no file or folder"),
-        (tmp_path, f"{tmp_path} holds no scene.nsvq"),
-    ):
+    for path in (tmp_path / "bad.nsvq", tmp_path / "missing.nsvq", tmp_path):
         assert main(["info", str(path)]) == 1
         captured = capsys.readouterr()
         assert captured.out == ""
         assert captured.err.count("\n") == 1
-        assert captured.err.startswith(f"nsvq info: {start}")
+        assert captured.err.startswith(f"nsvq info: {path}: ")
