@@ -82,10 +82,10 @@ def run(options: argparse.Namespace) -> int:
     writer = {"palette": options.palette, "version": options.spz_version, "axes": options.spz_axes}
     given = {name: value for name, value in writer.items() if value is not None}
     size = formats.save(scene, output, Storage(options.level) if options.level else None, **given)
-    # What reading the output back would say of it is known here.
-    logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
     say(f"{output}: {len(scene):,} splats in {size:,} bytes, {size / len(scene):.1f} per splat")
     if options.measure:
+        # What reading the files again would say of them is known here.
+        logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
         _measure(options.inputs[0], output, options.root)
     return 0
 

@@ -62,11 +62,11 @@ def run(options: argparse.Namespace) -> int:
     path = options.scene.resolve()
     title = f"{path.parent.name} / {path.name}" if path.is_dir() else path.name
     with _nsvq_file(options) as file:
+        if options.output is not None and file.stat().st_size > _LARGEST:
+            raise ValueError(f"{path}: browsers open no page so large: nsvq compress makes it smaller")
         cameras = _cameras(options, file)
         if options.output is not None:
             make_folder_of(options.output)
-            if file.stat().st_size > _LARGEST:
-                raise ValueError(f"{path}: browsers open no page so large: nsvq compress makes it smaller")
             size = write_viewer(options.output, file, cameras, title)
             say(f"{options.output}: {size:,} bytes")
             return 0

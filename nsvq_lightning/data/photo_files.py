@@ -195,8 +195,8 @@ def find_masks(
         if not usual:
             log.info("masks are read from %s", shown)
         (masks,) = found.values()
-        choice = zip(given, masks, strict=True) if has_own else zip(masks, given, strict=True)
-        return [first or second for first, second in choice]
+        first, second = (given, masks) if has_own else (masks, given)
+        return [one or other for one, other in zip(first, second, strict=True)]
     if found:
         log.warning("masks in %s are not used: choose a folder (--data.masks)", shown)
     elif usual and not has_own:

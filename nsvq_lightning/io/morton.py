@@ -181,10 +181,10 @@ def spatial_order(means: Float32s) -> Integers:
     """
     from nsvq_lightning.rendering.frame import middle_of
 
-    cells, _ = Grid.around(means, np.zeros(len(means))).cells(means)
-    keys = morton_keys(cells, np.full(len(means), AXIS_BITS))
     if not len(means):
         return np.arange(0)
+    cells, _ = Grid.around(means, np.zeros(len(means))).cells(means)
+    keys = morton_keys(cells, np.full(len(means), AXIS_BITS))
     middle, usual = middle_of(means)
     _, doublings = np.frexp(np.linalg.norm(means - middle, axis=1) / max(usual, 1e-30) / 2)
     return np.lexsort((keys, doublings.clip(0)))

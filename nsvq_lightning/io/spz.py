@@ -281,7 +281,7 @@ def _signs(axes: str, sh_degree: int) -> tuple[Float32s, Float32s, Float32s]:
     return xyz, np.array([1, *(xyz.prod() * xyz)], np.float32), harmonics.repeat(3)
 
 
-def in_spz_order(scene: CompressedScene) -> CompressedScene:
+def _in_file_order(scene: CompressedScene) -> CompressedScene:
     """The splats that a file holds, in its order: by their codes, then by position.
 
     The codes of the spherical harmonics come first: in both versions, equal rows compress best when close together.
@@ -323,7 +323,7 @@ def write_spz(
         raise ValueError(f"version of .spz must be {' or '.join(map(str, SPZ_VERSIONS))}, got {version}")
     if axes not in SPZ_AXES:
         raise ValueError(f"axes of .spz must be {' or '.join(SPZ_AXES)}, got {axes!r}")
-    scene = in_spz_order(scene)
+    scene = _in_file_order(scene)
     clamped = Clamped()
     xyz, quats, harmonics = _signs(axes.upper(), scene.sh_degree)
     fraction = _fraction_bits(scene)

@@ -182,6 +182,7 @@ def read_cameras(path: Path) -> dict[str, Camera]:
         OSError: It cannot be read.
     """
     cameras = {}
+    arguments = arguments_of(path.parent)
     advice = ": move it away, or name the photos with --data.root"
     with _refused(f"{path} is no list of cameras as INRIA's trainer writes it", advice):
         for entry in json.loads(path.read_bytes()):
@@ -194,7 +195,7 @@ def read_cameras(path: Path) -> dict[str, Camera]:
             name = str(entry["img_name"])
             if name in cameras:  # the names of photos in several folders, without these
                 name = f"{name} ({entry['id']})"
-            times = 1 if "cx" in entry else _times_smaller(arguments_of(path.parent), width)
+            times = 1 if "cx" in entry else _times_smaller(arguments, width)
             small = tuple(number / times for number in lens)
             size = round(width / times), round(height / times)
             cameras[name] = camera_of(view_from(rotation, position), small, *size)

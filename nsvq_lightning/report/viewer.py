@@ -141,13 +141,12 @@ def write_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
     """Write cameras as INRIA's trainer lists them, which viewers read, with their principal points beside."""
     entries = []
     for number, (name, camera) in enumerate(cameras.items()):
-        pose = camera.viewmat.double().inverse()
         entries.append(
             {
                 "id": number,
                 "img_name": name,
-                "position": pose[:3, 3].tolist(),
-                "rotation": pose[:3, :3].tolist(),
+                "position": camera.position.tolist(),
+                "rotation": camera.viewmat[:3, :3].T.tolist(),
                 **lens_entry(camera),
             }
         )
