@@ -65,7 +65,7 @@ class ExportScene(WritingCallback):
         photos = scene_of(trainer)
         if "nsvq" in self.formats and photos is not None:
             page = folder / "viewer.html"
-            title = page.resolve().parent.parent.name
+            title = photos.root.resolve().name
             cameras = dict(zip(photos.names, photos.cameras, strict=True))
             with optional(page):
                 viewer.write_cameras(folder / CAMERAS, cameras)

@@ -228,6 +228,8 @@ def test_a_run_of_a_sweep_is_the_run_alone(
     alone = ["fit", f"--config={configs[0]}", f"--data.root={demo_scene}", *OPTIONS]
     assert main([*alone, f"--trainer.run_folder={tmp_path / 'alone'}", "--trainer.logger=false"]) == 0
     assert same(swept[2][0]["folder"], tmp_path / "alone")
+    for folder in (swept[2][0]["folder"], tmp_path / "alone"):
+        assert f"<h1>{demo_scene.name}</h1>" in Path(folder, "viewer.html").read_text(encoding="utf-8")
 
 
 def test_what_its_command_has_trained_is_collected(
