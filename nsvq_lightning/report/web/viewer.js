@@ -594,7 +594,8 @@ async function load(version) {
   const engine = await startEngine(element("decoder").textContent);
   try {
     const file = server ? await server.bytes() : bytesOf(element("file").textContent.trim()), bytes = file.length;
-    say(`Decoding ${(bytes / 1e6).toFixed(2)} MB…`);
+    // A newer scene takes the place of the one that is shown.
+    if (!element("facts").textContent) say(`Decoding ${(bytes / 1e6).toFixed(2)} MB…`);
     await shown();
     const splats = await engine.decode(file.buffer);
     const { iteration, of, phase, psnr } = splats.header.config?.live ?? {};
