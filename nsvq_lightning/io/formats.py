@@ -147,13 +147,14 @@ def format_of(path: StrPath) -> Format:
     if suffix := suffix_of(path):
         return FORMATS[suffix]
     supported = ", ".join(f"{suffix} ({entry.description})" for suffix, entry in FORMATS.items())
-    way = _WAYS.get(suffix := Path(path).suffix.lower())
-    advice = f"; {way}" if way else ""
-    raise ValueError(f"{path}: unknown suffix {suffix!r}; supported are {supported}{advice}")
+    way = _WAYS.get(suffix := Path(path).suffix.lower(), "name a file that ends so")
+    raise ValueError(f"{path}: unknown suffix {suffix!r}; supported are {supported}; {way}")
 
 
-# What turns files of other formats into some that are read.
+# What turns files of other formats, and folders, into some that are read.
 _WAYS = {
+    "": "of the folder of a run, name scene.nsvq in it",
+    ".ckpt": "of a run, nsvq export --ckpt_path FILE writes its scene",
     **dict.fromkeys((".usd", ".usdc", ".usdz"), usda.BINARY_REMEDY),
     **dict.fromkeys((".ksplat", ".lcc", ".lcc2"), "splat-transform (npm) converts it"),
     ".gltf": "save it as .glb",

@@ -163,6 +163,9 @@ def test_splats_without_a_rotation_are_counted(tmp_path: Path, caplog: pytest.Lo
         ("a.gltf", "as .glb"),
         ("a.zip", "name it .sog"),
         ("a.pt", "torch.load"),
+        ("runs/a", "name scene.nsvq in it"),
+        ("last.ckpt", "nsvq export --ckpt_path"),
+        ("a.obj", "name a file that ends so"),
     ],
 )
 def test_what_turns_other_files_into_some_that_are_read_is_said(name: str, way: str) -> None:
