@@ -127,7 +127,7 @@ class SplatModule(LightningModule):
             raise ValueError(f"background must be auto, black, white or random, got {background!r}")
         if not 0.0 <= dssim_weight <= 1.0:
             raise ValueError(f"dssim_weight must be between 0 and 1, got {dssim_weight}")
-        self.splats = Splats(sh_degree) if splats is None else Splats.from_tensors(*detached(splats))
+        self.splats = Splats(sh_degree) if splats is None else Splats.from_tensors(*map(Tensor.float, detached(splats)))
         self.codebooks = nn.ModuleDict(build_quantizers(quantizer, codebooks, self.splats))
         self.quantizer_settings = {
             name: {"quantizer": type(made).__name__, "codes": len(made.codebook)}
@@ -368,7 +368,9 @@ class SplatModule(LightningModule):
         photo = eight_bit(batch.image)
         scores = {"psnr": psnr(image, photo, batch.mask).float(), "ssim": ssim(image, photo, batch.mask)}
         prefix = "test" if self.trainer.testing else "val"
-        self.log_dict({f"{prefix}/{name}": score for name, score in scores.items()}, batch_size=1, sync_dist=True)
+        named = {f"{prefix}/{name}": score for name, score in scores.items()}
+        # Lightning averages the number of views over the processes, rounded down: a multiple of theirs is exact.
+        self.log_dict(named, batch_size=self.trainer.world_size, sync_dist=True)
         return {"image": image, **scores}
 
     validation_step = test_step

@@ -6,6 +6,7 @@ one of its processes continues to the bits of the run not interrupted.
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -178,6 +179,9 @@ def test_test_views_that_cannot_be_shared_evenly_score_the_same(one: Finished, t
     for end, other in zip(ours["phases"], theirs["phases"], strict=True):
         assert (end["psnr"], end["ssim"]) == pytest.approx((other["psnr"], other["ssim"]), rel=1e-6)
     assert len(list((two.folder / "renders").iterdir())) == 3
+    for each in (one, two):  # what loggers get, which Lightning averages
+        *_, last = csv.DictReader((each.folder / "metrics.csv").open())
+        assert float(last["test/psnr"]) == pytest.approx(theirs["psnr"], rel=1e-5)
 
 
 def test_a_checkpoint_of_two_processes_is_that_of_one(one: Finished, two: Finished) -> None:
