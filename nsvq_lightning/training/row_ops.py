@@ -22,9 +22,8 @@ log = logging.getLogger(__name__)
 # shows larger splats, so nothing would ever train or prune them.
 MAX_LOG_SCALE = 32.0
 
-FIRST_MOMENT = "exp_avg"
-# Per-row state of Adam; everything else in its state belongs to the whole parameter.
-MOMENTS = (FIRST_MOMENT, "exp_avg_sq", "max_exp_avg_sq")
+# Means of gradients; other numbers of each row are of their squares.
+FIRST_MOMENTS = ("exp_avg", "momentum_buffer")
 
 
 def append_rows(splats: Splats, optimizer: Optimizer, new: RawSplats) -> None:
@@ -104,7 +103,7 @@ def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: 
         raise ValueError(f"maps of {name} must be {[*values.shape, values.shape[-1]]}, got {list(maps.shape)}")
     replace_attribute(splats, name, values)
     for key, moment in _moments(optimizer, name).items():
-        factors = maps if key == FIRST_MOMENT else maps.square()
+        factors = maps if key in FIRST_MOMENTS else maps.square()
         moment.copy_((factors * moment[:, None, :]).sum(2))
 
 
@@ -115,9 +114,10 @@ def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -
 
 
 def _moments(optimizer: Optimizer, name: str) -> dict[str, Tensor]:
-    """Adam's moments of the group ``name``, which it has once it has been stepped."""
-    state = optimizer.state.get(find_group(optimizer, name)["params"][0], {})
-    return {key: state[key] for key in MOMENTS if key in state}
+    """Numbers of each row of the group ``name``, such as Adam's moments, which it has once it has been stepped."""
+    rows = find_group(optimizer, name)["params"][0]
+    found = optimizer.state.get(rows, {})
+    return {key: value for key, value in found.items() if getattr(value, "shape", None) == rows.shape}
 
 
 def trainable_rows(splats: Splats) -> tuple[Tensor, dict[str, int]]:
@@ -156,9 +156,10 @@ def _rebind(splats: Splats, optimizer: Optimizer, name: str, values: Tensor, edi
     group = find_group(optimizer, name)
     old = group["params"][0]
     new = nn.Parameter(values, requires_grad=old.requires_grad)
+    moments = _moments(optimizer, name)
     state = optimizer.state.pop(old, None)
     if state is not None:
-        optimizer.state[new] = {key: edit(value) if key in MOMENTS else value for key, value in state.items()}
+        optimizer.state[new] = state | {key: edit(moment) for key, moment in moments.items()}
     group["params"][0] = new
     setattr(splats, name, new)
 

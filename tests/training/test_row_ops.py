@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from nsvq_lightning.splats.attributes import ATTRIBUTES
-from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.splats.splats import Splats, detached
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.training.row_ops import (
     append_rows,
@@ -55,6 +56,33 @@ def test_a_kept_splat_trains_on_as_if_nothing_had_happened() -> None:
     trained(untouched, 3, oracle)
     for name in ATTRIBUTES:
         torch.testing.assert_close(getattr(edited, name), getattr(untouched, name)[mask], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    "make_optimizer",
+    [
+        lambda groups: torch.optim.SGD(groups, momentum=0.9),
+        torch.optim.RMSprop,
+        torch.optim.Adagrad,
+        torch.optim.Adamax,
+        lambda groups: torch.optim.Adam(groups, amsgrad=True),
+    ],
+)
+def test_rows_of_any_optimizer_follow(make_optimizer: Any) -> None:
+    mask = torch.tensor([True, False, True, True, False, True])
+    edited, untouched = make(6), make(6)
+    optimizer, oracle = (
+        make_optimizer(param_groups(each, {}, LearningRates(), extent=2.0)) for each in (edited, untouched)
+    )
+    trained(edited, 3, optimizer)
+    trained(untouched, 3, oracle)
+    keep_rows(edited, optimizer, mask)
+    trained(edited, 3, optimizer)
+    trained(untouched, 3, oracle)
+    for name in ATTRIBUTES:
+        torch.testing.assert_close(getattr(edited, name), getattr(untouched, name)[mask], rtol=0, atol=0)
+    append_rows(edited, optimizer, detached(make(2)))
+    trained(edited, 1, optimizer)
 
 
 def test_an_appended_splat_starts_without_moments_and_the_others_keep_theirs() -> None:
