@@ -43,7 +43,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name, side in (("K", 3), ("viewmat", 4)):
-            matrix = vars(self)[name] = torch.as_tensor(getattr(self, name))
+            matrix = vars(self)[name] = torch.as_tensor(getattr(self, name)).clone()
             if matrix.requires_grad or matrix.shape != (side, side):  # rendering has no gradient by cameras
                 raise ValueError(f"Camera.{name} must be detached, of shape [{side}, {side}], got {list(matrix.shape)}")
         if not all(isinstance(side, Integral) and side > 0 for side in self.size):
@@ -52,10 +52,9 @@ class Camera:
         # Kept as Python floats: reading them from an accelerator would stall it at every render.
         intrinsics = fx, fy, cx, cy
         turn = self.viewmat.to("cpu", torch.float64, copy=True)
-        *rows, _ = turn.tolist()
-        rotation, translation = [row[:3] for row in rows], [row[3] for row in rows]
-        position = [-sum(row[k] * t for row, t in zip(rotation, translation, strict=True)) for k in range(3)]
-        packed_view = *(x for row in rotation for x in row), *translation, *position
+        rotation, translation = turn[:3, :3], turn[:3, 3:]
+        position = -(rotation * translation).sum(0)
+        packed_view = tuple(torch.cat([rotation.ravel(), translation.ravel(), position]).tolist())
         vars(self).update(intrinsics=intrinsics, packed_view=packed_view)
         if not (all(map(math.isfinite, intrinsics)) and min(fx / self.width, fy / self.height) > MIN_FOCAL):
             raise ValueError(f"Camera.K needs positive, finite focal lengths and a centre, in pixels, got {intrinsics}")

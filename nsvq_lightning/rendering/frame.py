@@ -6,8 +6,8 @@ extent is 5, as it is in most scenes of COLMAP: learning rates, first sizes and 
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeAlias
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -71,18 +71,16 @@ class Frame:
         """Points ``[P, 3]`` of the files, here; rounded."""
         return np.rint((points - self.middle) / self.unit * STEPS) / STEPS
 
+    @lru_cache(4096)  # noqa: B019  both are small, and every step asks for one
     def camera(self, camera: Camera) -> Camera:
         """A camera of the files, here."""
         if self == Frame():
             return camera
-        known = _cameras.setdefault(camera, {})
-        if self not in known:
-            packed = np.array(camera.packed_view)
-            view = viewmat_of(packed[:9].reshape(3, 3), self.points(packed[None, 12:])[0])
-            near = float(f"{camera.near / self.unit:.6g}")
-            moved = Camera(camera.K.double(), torch.from_numpy(view), *camera.size, near)
-            known[self] = moved.to(dtype=torch.float32)
-        return known[self]
+        packed = np.array(camera.packed_view)
+        view = viewmat_of(packed[:9].reshape(3, 3), self.points(packed[None, 12:])[0])
+        return Camera(
+            camera.K.double(), torch.from_numpy(view), *camera.size, float(f"{camera.near / self.unit:.6g}")
+        ).to(dtype=torch.float32)
 
     def sampling(self, sampling: Sampling | None) -> Sampling | None:
         """The sampling of splats of the files, here."""
@@ -96,10 +94,6 @@ class Frame:
         middle = raw.means.new_tensor(self.middle, dtype=torch.float64)
         means = ((raw.means.double() - middle) / self.unit).to(raw.means)
         return raw._replace(means=means, scales=(raw.scales.double() - math.log(self.unit)).to(raw.scales))
-
-
-# Cameras of the files, and what they are in frames.
-_cameras: WeakKeyDictionary[Camera, dict[Frame, Camera]] = WeakKeyDictionary()
 
 
 def reach_of(distances: Float64s) -> float:

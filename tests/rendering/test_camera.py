@@ -34,6 +34,15 @@ def test_a_moved_camera_keeps_its_numbers() -> None:
     assert camera.K.dtype == torch.float32
 
 
+@pytest.mark.parametrize("kind", [torch.Tensor.clone, torch.Tensor.numpy])
+def test_a_camera_keeps_its_place_when_the_callers_matrix_is_filled_anew(kind: Any) -> None:
+    pose = torch.eye(4)
+    camera = Camera(K, kind(pose), 40, 30)
+    given = Camera(K, pose, 40, 30)
+    pose[2, 3] = 7.0
+    assert given.viewmat[2, 3] == camera.viewmat[2, 3] == 0 == given.position.abs().max()
+
+
 @pytest.mark.parametrize(("matrix", "pose"), [(K.numpy(), np.eye(4)), (K.tolist(), np.eye(4).tolist())])
 def test_arrays_and_lists_are_cameras_as_tensors_are(matrix: Any, pose: Any) -> None:
     camera = Camera(matrix, pose, 40, 30)
