@@ -15,13 +15,13 @@ from nsvq_lightning.splats import attributes as splat
 from nsvq_lightning.splats.conventions import Arrays, Bools, Float32s, Float64s, Integers, shN_degree
 
 if TYPE_CHECKING:
-    from torch.nn import ParameterDict
+    from torch.nn import Module
 
     from nsvq_lightning.rendering.camera import Camera
     from nsvq_lightning.rendering.rasterize import Render
     from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors
 
-    AnySplats: TypeAlias = "CompressedScene | SplatTensors | Mapping[str, Any] | ParameterDict"
+    AnySplats: TypeAlias = "CompressedScene | SplatTensors | Mapping[str, Any] | Module"
 
 log = logging.getLogger(__name__)
 
@@ -110,7 +110,8 @@ class CompressedScene:
 
         Args:
             splats: The splats, or their attributes by their names here or in nerfstudio, tensors or arrays of any
-                numbers, or a checkpoint of gsplat with these; a compressed scene is returned as it is.
+                numbers, or a checkpoint of gsplat with these; or a module that was trained, whose
+                :meth:`~nsvq_lightning.SplatModule.compressed` it is; a compressed scene is returned as it is.
             header: ``antialiased``, ``metrics`` and ``origin``; or ``config``.
 
         Raises:
@@ -122,6 +123,10 @@ class CompressedScene:
 
         if isinstance(splats, CompressedScene):
             return splats
+        if hasattr(splats, "compressed"):
+            return splats.compressed()  # type: ignore[no-any-return, operator, union-attr]  # a module
+        if getattr(splats, "edits", 0):
+            log.warning("the splats of a module are in coordinates of training: give the module itself")
         named = splats if isinstance(splats, Mapping | torch.nn.ParameterDict) else detached(splats)._asdict()
         rows = {
             NERFSTUDIO.get(name, name): values.detach().to("cpu", torch.float32, copy=True).numpy()

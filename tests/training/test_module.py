@@ -13,10 +13,12 @@ from torch import Tensor, nn
 from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
+from nsvq_lightning.io import load, save
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.rendering.rasterize import render, visible
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import RawSplats, Splats
@@ -221,6 +223,25 @@ def test_given_splats_stay_as_they_are(demo_scene: Path) -> None:
     trainer.fit(module, ColmapDataModule(demo_scene))
     assert all(torch.equal(one, other) for one, other in zip(splats.raw(), before, strict=True))
     assert not torch.equal(module.splats.means, splats.means)
+
+
+def test_splats_of_another_precision_are_trained_in_float32() -> None:
+    splats = SplatModule(codebooks=None, splats=make_splats().double()).splats
+    assert {parameter.dtype for parameter in splats.parameters()} == {torch.float32}
+    assert torch.equal(splats.means, make_splats().means)
+
+
+def test_a_module_is_saved_where_its_files_are(
+    module: SplatModule, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    module.frame = Frame(2.0, (1.0, 2.0, 3.0))
+    save(module, tmp_path / "scene.ply")
+    assert "coordinates of training" not in caplog.text
+    expected = 2 * module.splats.means.detach() + torch.tensor([1.0, 2.0, 3.0])
+    torch.testing.assert_close(load(tmp_path / "scene.ply").means.detach(), expected)
+    module.splats.edits = 1  # as once splats have grown
+    save(module.splats, tmp_path / "scene.ply")
+    assert "in coordinates of training: give the module itself" in caplog.text
 
 
 def test_trained_splats_are_rendered_with_all_their_coefficients() -> None:
