@@ -65,11 +65,10 @@ class ExportScene(WritingCallback):
         photos = scene_of(trainer)
         if "nsvq" in self.formats and photos is not None:
             page = folder / "viewer.html"
-            title = photos.root.resolve().name
             cameras = dict(zip(photos.names, photos.cameras, strict=True))
             with optional(page):
                 viewer.write_cameras(folder / CAMERAS, cameras)
-                size = viewer.write_viewer(page, folder / "scene.nsvq", cameras, title)
+                size = viewer.write_viewer(page, folder / "scene.nsvq", cameras, photos.root.resolve().name)
                 log.info("wrote %s (%d bytes)", page, size)
 
 

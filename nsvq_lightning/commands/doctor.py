@@ -162,12 +162,12 @@ MIN_DISK = 2 << 30
 def check_room(folder: Path) -> Iterator[Finding]:
     """Memory for a run, and disk space for checkpoints, report and exports where runs are written."""
     free = available_memory()
-    text = "not told by this system" if free is None else f"{readable_bytes(free)} available"
+    text = "not told by this system" if free is None else f"{free / 1e9:.1f} GB available"
     advice = "a usual run takes 2 to 4 GB; end programs, or try --data.max_width 800 --data.cache_bytes 500000000"
     yield judged("memory", text, advice, when=free is not None and free < 4 << 30)
     disk = shutil.disk_usage(folder).free
     writable = os.access(folder, os.W_OK)
-    text = f"{readable_bytes(disk)} free in {folder.resolve()}{'' if writable else ', which is read-only'}"
+    text = f"{disk / 1e9:.1f} GB free in {folder.resolve()}{'' if writable else ', which is read-only'}"
     advice = "checkpoints of a run take about 1 GB; see --trainer.default_root_dir"
     yield judged("disk", text, advice, when=disk < MIN_DISK or not writable)
 
@@ -359,18 +359,12 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
     yield Finding("good", "run time", f"about {minutes:.0f} min for fast.yaml, on a machine as busy as now")
 
 
-def readable_bytes(count: float) -> str:
-    """A number of bytes in readable form."""
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
-
-
 def available_memory() -> int | None:
     """Bytes that this process may still allocate: of the machine, or of its control group if less; None if not told."""
     limits = []
     with suppress(OSError):
-        found = re.search(r"^MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text(encoding="ascii"), re.MULTILINE)
-        if found:
-            limits.append(1024 * int(found[1]))
+        told = Path("/proc/meminfo").read_text(encoding="ascii")
+        limits += [1024 * int(number) for number in re.findall(r"^MemAvailable:\s+(\d+)", told, re.MULTILINE)]
     group = Path("/sys/fs/cgroup")
     with suppress(OSError, ValueError):  # "max" is no number, and no limit
         limit = int((group / "memory.max").read_text(encoding="ascii"))

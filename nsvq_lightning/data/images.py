@@ -361,7 +361,7 @@ class ImageStore:
         held: Pictures that are there already and need no source.
 
     Raises:
-        ValueError: ``cache_bytes`` is negative.
+        ValueError: ``cache_bytes`` is negative, or a mask is not bool.
     """
 
     def __init__(
@@ -369,6 +369,9 @@ class ImageStore:
     ) -> None:
         if cache_bytes < 0:
             raise ValueError(f"cache_bytes must be at least 0, got {cache_bytes}")
+        for _, mask in held:
+            if mask is not None and mask.dtype != torch.bool:
+                raise ValueError(f"masks must be bool, got {mask.dtype}")
         self.sources = tuple(sources)
         self.nbytes = sum(source.nbytes for source in self.sources) + sum(picture.nbytes for picture in held)
         """Bytes of all pictures, decoded."""

@@ -130,7 +130,7 @@ class Splats(nn.Module):
             opacity: Of each splat, between 0 and 1.
 
         Raises:
-            ValueError: No usable point is left.
+            ValueError: No usable point is left, or colours are not in [0, 1].
         """
         points, colors = points.detach().cpu().float(), colors.detach().cpu().float()
         finite = torch.isfinite(points).all(1) & torch.isfinite(colors).all(1)
@@ -140,6 +140,8 @@ class Splats(nn.Module):
         n = len(points)
         if n == 0:
             raise ValueError("the point cloud has no finite point; reconstruct the scene again or start from a .ply")
+        if colors.max() > 1:
+            raise ValueError(f"colours of points are up to {colors.max():g}, not in [0, 1]: divide bytes by 255")
         spread = _mean_squared_neighbour_distance(points).clamp(1e-7, 4.0)
         return cls.from_tensors(
             means=points,

@@ -117,3 +117,5 @@ def test_first_splats_are_as_large_as_their_distance_says() -> None:
     other = Splats.from_points(points, torch.full_like(points, 0.5), sh_degree=1, opacity=0.3)
     assert torch.equal(other.scales, plain.scales)
     assert other.opacities.sigmoid().tolist() == pytest.approx([0.3] * 8)
+    with pytest.raises(ValueError, match=r"colours of points are up to 255, not in \[0, 1\]: divide bytes by 255"):
+        Splats.from_points(points, torch.full_like(points, 255, dtype=torch.uint8))
