@@ -46,7 +46,8 @@ def atomic_path(path: StrPath) -> Iterator[Path]:
             temporary.chmod(target.stat().st_mode & 0o7777)
         os.replace(temporary, target)
     except BaseException as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # not there, or in a folder that is read only
+            temporary.unlink()
         # That of a full disk does not say which file, or names this one.
         if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
             error.filename = str(path)

@@ -367,8 +367,7 @@ class SplatModule(LightningModule):
         image = apply_mask(self.predict_step(batch, batch_idx)["image"], batch.mask)
         photo = eight_bit(batch.image)
         scores = {"psnr": psnr(image, photo, batch.mask).float(), "ssim": ssim(image, photo, batch.mask)}
-        prefix = "test" if self.trainer.testing else "val"
-        named = {f"{prefix}/{name}": score for name, score in scores.items()}
+        named = {f"{'test' if self.trainer.testing else 'val'}/{name}": score for name, score in scores.items()}
         # Lightning averages the number of views over the processes, rounded down: a multiple of theirs is exact.
         self.log_dict(named, batch_size=self.trainer.world_size, sync_dist=True)
         return {"image": image, **scores}

@@ -40,6 +40,16 @@ def test_a_full_disk_is_told_with_the_file(tmp_path: Path) -> None:
         write()
 
 
+def test_a_folder_that_became_read_only_is_told_with_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path, *_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(OSError, match="Read-only file system") as caught, atomic_path(tmp_path / "scene.ply") as path:
+        refuse(path)
+    assert caught.value.filename == str(tmp_path / "scene.ply")
+
+
 def test_permissions_are_those_of_an_ordinary_file_or_of_the_old_one(tmp_path: Path) -> None:
     plain, ours = tmp_path / "plain", tmp_path / "ours"
     plain.write_bytes(b"")
