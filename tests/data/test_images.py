@@ -255,10 +255,8 @@ def test_budget_keeps_what_fits(sources: list[_Counting], budget: int, decodings
 
 def test_masks_that_are_held_are_boolean() -> None:
     image = torch.zeros(2, 3, 3, dtype=torch.uint8)
-    assert (
-        ImageStore((), held=[Picture(image, None), Picture(image, torch.ones(2, 3, dtype=torch.bool))])[1].image
-        is image
-    )
+    held = [Picture(image, None), Picture(image, torch.ones(2, 3, dtype=torch.bool))]
+    assert ImageStore((), held=held)[1].image is image
     with pytest.raises(ValueError, match=r"masks must be bool, got torch\.uint8"):
         ImageStore((), held=[Picture(image, torch.full((2, 3), 255, dtype=torch.uint8))])
 
