@@ -152,11 +152,12 @@ class PhaseSchedule(SplatCallback):
             )
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
-        """Check that a run continues in the phase that the module is in.
+        """Check that a run continues in the phase that the module is in, to the end that its warm-up has decided.
 
         Raises:
             ValueError: In this schedule, the last trained iteration is in another phase.
         """
+        self._set_max_steps(trainer, self._steps - module.schedule.saved)
         step = trainer.global_step
         expected = module.schedule.phase_at(step) if step else Phase.WARMUP
         # A checkpoint may have been written just after the next iteration began.

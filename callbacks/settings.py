@@ -19,15 +19,6 @@ class Bound(NamedTuple):
         """As the API reference shows it."""
         return self.words
 
-    def check(self, name: str, value: float | None) -> None:
-        """Check the value of a setting.
-
-        Raises:
-            ValueError: It is out of the bound, or not finite.
-        """
-        if value is not None and not (math.isfinite(value) and self.holds(value)):
-            raise ValueError(f"{name} must be {self.words}, got {value}")
-
 
 AT_LEAST_1 = Bound("at least 1", lambda value: value >= 1)
 AT_LEAST_0 = Bound("at least 0", lambda value: value >= 0)
@@ -49,7 +40,8 @@ def check_settings(callback: object) -> None:
         ValueError: A setting is out of its bound, or not finite.
     """
     for name, hint in get_type_hints(type(callback), include_extras=True).items():
+        value = getattr(callback, name, None)
         for kind in (hint, *get_args(hint)):  # of ``Count | None``, each
             for bound in getattr(kind, "__metadata__", ()):
-                if isinstance(bound, Bound):
-                    bound.check(name, getattr(callback, name))
+                if isinstance(bound, Bound) and value is not None and not (math.isfinite(value) and bound.holds(value)):
+                    raise ValueError(f"{name} must be {bound.words}, got {value}")

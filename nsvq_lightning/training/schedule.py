@@ -181,12 +181,15 @@ class Schedule:
         """The interval ``reference``, in reference iterations, but at least ``minimum`` iterations of this run."""
         return max(reference, minimum / self.scale) if self.scale < 1 else reference
 
+    @lru_cache  # noqa: B019  callbacks ask in every step
     def times(self, start: float, last: float, every: int, minimum: int = 1) -> tuple[int, ...]:
         """The iterations ``start, start + every, …, last`` of the reference run as iterations of this run.
 
         Each is rounded separately: an interval rounded up would lose the last of them.
         """
-        return _times(self, start, last, self.stride(every, minimum))
+        stride = self.stride(every, minimum)
+        count = math.floor((last - start) / stride + 1e-9) + 1
+        return tuple(dict.fromkeys(self.iteration(start + k * stride) for k in range(count)))
 
     def density_times(self, start: int, last: int, every: int) -> tuple[int, ...]:
         """Iterations at which splats are cloned, split and pruned."""
@@ -232,10 +235,3 @@ class Schedule:
         the tenfold λ brought to half, at the same test PSNR (25.43 and 25.44 dB).
         """
         return reference / self.scale
-
-
-@lru_cache
-def _times(schedule: Schedule, start: float, last: float, stride: float) -> tuple[int, ...]:
-    """Cached, because callbacks ask in every step."""
-    count = math.floor((last - start) / stride + 1e-9) + 1
-    return tuple(dict.fromkeys(schedule.iteration(start + k * stride) for k in range(count)))

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -254,6 +255,24 @@ def test_a_run_that_goes_on_past_its_schedule_keeps_its_checkpoints(run: RunFact
     kept = {iteration_of(path) for path in (whole / "checkpoints").glob("step-*.ckpt")}
     assert kept == {6, 12, 18, 24, *Schedule(total=20, min_finetune=1).ends, 27}
     assert_same_end(fit(RunCheckpoint(every=0), whole / "checkpoints" / "step-24.ckpt"), whole)
+
+
+class IdleGrowth(Callback):
+    """Ends the warm-up after iteration 2."""
+
+    def on_train_batch_end(self, trainer: Trainer, module: SplatModule, *_: Any) -> None:  # type: ignore[override]
+        if trainer.global_step == 2:
+            module.schedule = replace(module.schedule, saved=module.schedule.ends[0] - 2)
+
+
+def test_a_run_whose_warm_up_ended_early_is_not_longer_when_it_is_continued(run: RunFactory, recipe: Recipe) -> None:
+    def fit(ckpt_path: Path | None = None) -> Path:
+        trainer, module = run([*recipe(checkpoint=RunCheckpoint(every=0)).values(), IdleGrowth()], ckpt_path)
+        assert trainer.global_step == module.schedule.total - module.schedule.saved < module.schedule.total
+        return run_folder(trainer)
+
+    whole = fit()
+    assert_same_end(fit(whole / "checkpoints" / "last.ckpt"), whole)
 
 
 def arguments_of(scene: Path, folder: Path, *more: str) -> list[str]:
