@@ -53,7 +53,7 @@ def read_poses(
         model = str(model)  # a number in Python
         files = [root / model] if model.endswith(".json") else []
     if files:
-        poses = _read_transforms(root, files, allow_outside)
+        poses = _read_transforms(files, allow_outside)
         return poses if len(poses.points) else _with_colmap_points(poses, root)
     poses = colmap.read_model(root, observations, model)
     cloud = cloud_in([colmap.model_files(root, model)["images"].parent, root]) if not len(poses.points) else None
@@ -141,7 +141,7 @@ class _Frame:
     def name(self) -> str:
         """Path of its photo, relative to the scene folder."""
         folder = self.file.parent
-        return str(self.photo.relative_to(folder) if self.photo.is_relative_to(folder) else self.photo)
+        return (self.photo.relative_to(folder) if self.photo.is_relative_to(folder) else self.photo).as_posix()
 
     def lens(self) -> _Lens:
         """Its camera.
@@ -219,7 +219,7 @@ class _Frame:
         return viewmat_of((rotation * (1, -1, -1)).T, matrix[:3, 3])
 
 
-def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> ColmapModel:
+def _read_transforms(files: list[Path], allow_outside: bool) -> ColmapModel:
     """What one file lists, or two: the train and the test views.
 
     Raises:
@@ -237,7 +237,7 @@ def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> Colm
     names = sorted(train | test if is_split else frames)
     if len(names) < len(frames):
         log.info("%s: %d of %d photos are not used, by its lists", files[0], len(frames) - len(names), len(frames))
-    tops = {PurePosixPath(name).parts[0] if "/" in name else "." for name in names}
+    tops = {PurePosixPath(name).parts[0] if "/" in name and not colmap.is_outside(name) else "." for name in names}
     folder = tops.pop() if len(tops) == 1 else "."
     numbers: dict[_Lens, int] = {}
     images = []
@@ -253,7 +253,7 @@ def _read_transforms(root: Path, files: list[Path], allow_outside: bool) -> Colm
         points=points,
         colors=colors,
         source=files[0].name,
-        images_folder=str((files[0].parent / folder).absolute()),
+        images_folder=f"{files[0].parent.absolute()}/{folder}",  # keeps ".", beside which is no "._2"
         test=tuple(row for row, name in enumerate(names) if name in test) if is_split else None,
         synthetic=files[0].name == "transforms_train.json",
     )

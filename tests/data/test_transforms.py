@@ -129,6 +129,37 @@ def test_scaled_copies_of_the_photos_are_used(make_scene: SceneFactory, tmp_path
     assert load_scene(root, factor=4).view(4).image.shape == (8, 10, 3)
 
 
+def test_copies_of_another_size_are_not_those_of_another_scene(make_scene: SceneFactory, tmp_path: Path) -> None:
+    """Photos lie in two folders, so that of all is the scene's own; beside it, ``room_2`` is another room."""
+    colmap = make_scene()
+    for name in ("room", "room_2"):
+        root = write_pinhole(colmap, tmp_path / name)
+        (root / "images" / "003.png").rename(root / "003.png")
+        text = (root / "transforms.json").read_text()
+        (root / "transforms.json").write_text(text.replace("./images/003.png", "003.png"))
+    assert cv2.imwrite(str(root / "003.png"), np.full((32, 40, 3), 7, np.uint8))
+    whole, half = (load_scene(tmp_path / "room", factor=factor) for factor in (None, 2))
+    assert [source.path for source in half.images.sources] == [source.path for source in whole.images.sources]
+    assert half.view(3).image.shape == (16, 20, 3)
+
+
+def test_masks_beside_photos_elsewhere_are_not_looked_for(
+    make_scene: SceneFactory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = write_pinhole(make_scene(), tmp_path / "project" / "photos")
+    export = tmp_path / "project" / "export" / "transforms.json"
+    export.parent.mkdir()
+    masks = tmp_path / "project" / "masks" / "photos" / "images"
+    masks.mkdir(parents=True)
+    for path in (root / "images").iterdir():
+        assert cv2.imwrite(str(masks / path.name), np.zeros((32, 40), np.uint8))
+    for elsewhere in ("../photos/images", f"{root}/images"):
+        export.write_text((root / "transforms.json").read_text().replace("./images", elsewhere))
+        scene = load_scene(export.parent, allow_outside=True)
+        assert not any(source.mask for source in scene.images.sources)
+        assert Path(scene.images.sources[0].path).samefile(root / "images" / "000.png")
+
+
 def test_blender_scenes_have_their_own_split_and_random_points(
     demo_scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
