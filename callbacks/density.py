@@ -104,7 +104,7 @@ class Densification(SplatCallback, ABC):
     def prune(self, module: SplatModule, mask: Tensor) -> int:
         """Remove the splats of ``mask [N]``, unless fewer than :attr:`min_splats` would be left; returns how many."""
         count = int(mask.sum())
-        if len(module.splats) - count < self.min_splats:
+        if count and len(module.splats) - count < self.min_splats:
             log.warning(
                 f"iteration {module.trainer.global_step}: pruning {count} of {len(module.splats)} splats would leave "
                 f"fewer than min_splats={self.min_splats}; skipped. Opacities or scales have collapsed: lower the "

@@ -24,6 +24,7 @@ from nsvq_lightning.rendering.sampling import Sampling
 from nsvq_lightning.report import numbers, page, pictures
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
+from nsvq_lightning.training.run_scene import scene_of
 from nsvq_lightning.training.stopwatch import TimesBeside
 
 from .base import WritingCallback, picture_file
@@ -115,11 +116,11 @@ class MetricReport(WritingCallback):
         done = module.history[-1]["iteration"] if module.history else 0
         if iteration <= done or is_fast_dev_run(trainer):
             return
-        datamodule = getattr(trainer, "datamodule", None)
-        if datamodule is None or not datamodule.scene.test:
+        if not getattr(scene_of(trainer), "test", ()):
             return
+        views = trainer.datamodule.test_dataloader()  # type: ignore[attr-defined]  # Lightning does not type it
         with module.stopwatch.paused(module.device), self._beside.timed("evaluations"):
-            self._evaluate(trainer, module, iteration, datamodule.test_dataloader())
+            self._evaluate(trainer, module, iteration, views)
             notify_monitors(trainer, module)
 
     # The end of the run: before Lightning's own work at the end of its only epoch; where no epoch has ended; and of one

@@ -150,7 +150,7 @@ def _found_views(path: Path, root: Path | None, origin: "Place") -> "Views":
     in their size. Cameras that are found are those that a run has recorded, or those in the scene's folder or up to two
     above; those of a folder are relative to the scene's origin.
     """
-    from nsvq_lightning.data.colmap import NoPhotosError
+    from nsvq_lightning.data.colmap import NoPhotosError, SceneError
     from nsvq_lightning.data.scene import load_cameras, load_scene
     from nsvq_lightning.data.transforms import has_poses
     from nsvq_lightning.rendering.camera_paths import CAMERAS, read_cameras
@@ -171,8 +171,10 @@ def _found_views(path: Path, root: Path | None, origin: "Place") -> "Views":
         how = {name: data[name] for name in READ if name in data} | {"origin": origin}
         try:
             scene = load_scene(folder, **how)
-        except NoPhotosError:
-            log.info("%s has cameras, but no photos", folder)
+        except SceneError as error:
+            if root and not isinstance(error, NoPhotosError):
+                raise
+            log.info("%s has cameras, but not all photos: %s", folder, error)
             return load_cameras(folder, **how), None
         return dict(zip(scene.names, scene.cameras, strict=True)), scene
     for place in [folder] if folder else folders_beside(path):

@@ -330,7 +330,7 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
         advice = f"most in {most}; masks are white where the photo counts; if not, invert them"
         yield judged("masks", text, advice, when=left_out > 0.7)
     folder = scene.root / (model.images_folder or "images")
-    if folder == scene.root:
+    if folder == scene.root.absolute():
         return  # that of a NeRF-synthetic scene, which also holds maps and further views
     files = photos_below(folder)
     extra = set(files).difference(source.path for source in scene.images.sources)

@@ -153,7 +153,7 @@ def plan(options: argparse.Namespace) -> list[Run]:
             quantizers = sizes = ("",)
         for scene, quantizer, size, seed in product(options.scenes, quantizers, sizes, options.seeds):
             # Absolute, so that the same sweep started from another folder finds its runs.
-            root = Path(scene or default["data"]["init_args"].get("root", "")).resolve()
+            root = Path(scene or default["data"]["init_args"].get("root", "")).expanduser().resolve()
             start = default["model"]["init_from"]
             chosen = {
                 "data.root": root,

@@ -135,7 +135,8 @@ class SceneDataModule(LightningDataModule):
         """
         number, views = (len(self.scene), "views") if stage == "predict" else (len(self.scene.test), "test views")
         if number < self.process[1]:
-            raise SceneError(f"{number} {views} cannot be shared by {self.process[1]} processes: use fewer devices")
+            processes = f"{self.process[1]} processes: use fewer devices, or more {views}"
+            raise SceneError(f"{number} {views} cannot be shared by {processes}")
 
     def train_dataloader(self) -> DataLoader[View]:
         """Endless train views from the trainer's step on; limit the run with ``max_steps``."""

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from lightning.pytorch import LightningDataModule
 
 from nsvq_lightning.callbacks import MetricReport
 from nsvq_lightning.commands.fit import RunLogger
 from nsvq_lightning.commands.main import main
+from nsvq_lightning.training.module import SplatModule
 
 HELD = ("curve.csv", "report.html", "preview.png", "views.csv", "viewer.html", "scene.ply", "view_000.png")
 
@@ -64,6 +67,13 @@ def test_what_a_run_is_for_must_be_written(
     held.append(name)
     assert fit(demo_scene, tmp_path / "run") == 1
     assert name in capsys.readouterr().err
+
+
+def test_a_data_module_without_a_scene_has_no_curve() -> None:
+    trainer: Any = SimpleNamespace(global_step=7, fast_dev_run=False, datamodule=LightningDataModule())
+    module = SplatModule()
+    MetricReport().on_fit_end(trainer, module)
+    assert module.history == []
 
 
 def test_the_times_of_a_second_run_are_its_own(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,6 +28,7 @@ from nsvq_lightning.commands.arguments import (
     views_of,
 )
 from nsvq_lightning.commands.main import main
+from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.scene import load_cameras, load_scene
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import read_scene, save
@@ -180,6 +181,19 @@ def test_cameras_of_a_run_are_of_the_model_that_it_trained(tmp_path: Path, demo_
     assert len(cameras) == len(load_scene(demo_scene))
     shutil.rmtree(scene / "photos")
     assert known_views(tmp_path, None)[0].keys() == cameras.keys()
+
+
+def test_cameras_of_a_run_are_found_though_a_photo_is_gone(tmp_path: Path, demo_scene: Path) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(demo_scene, scene)
+    (tmp_path / "config.yaml").write_text(f"data: {{init_args: {{root: {scene}, factor: 2}}}}")
+    before = known_views(tmp_path, None)[0]
+    next((scene / "images").iterdir()).unlink()
+    cameras, photos = known_views(tmp_path, None)
+    assert photos is None
+    assert {name: camera.size for name, camera in cameras.items()} == {name: each.size for name, each in before.items()}
+    with pytest.raises(SceneError, match=r"1 of 9 images of the model are not in"):
+        known_views(tmp_path, scene)
 
 
 def test_no_cameras_are_found_where_there_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from transforms_scenes import write_blender
 
 from nsvq_lightning.callbacks import forecast
 from nsvq_lightning.commands import doctor
@@ -183,6 +184,15 @@ def test_files_outside_the_model_and_of_another_shape_are_named(scene: Path) -> 
     findings = _by_subject(scene)
     assert findings["registered"].text.startswith("1 of 10 files")
     assert (findings["sizes"].verdict, "1 of 9 files" in findings["sizes"].text) == ("problem", True)
+
+
+def test_maps_of_a_synthetic_scene_are_no_photos(
+    scene: Path, demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = write_blender(demo_scene, tmp_path / "lego")
+    shutil.copy(scene / "images/view_000.png", root / "test" / "r_0_depth.png")
+    monkeypatch.chdir(tmp_path)
+    assert "registered" not in _by_subject(Path("lego"))
 
 
 def test_masks_that_exclude_most_are_noted(scene: Path) -> None:

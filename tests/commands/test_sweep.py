@@ -75,6 +75,8 @@ def test_everything_is_combined_with_everything(scenes: tuple[str, str]) -> None
 def test_a_run_starts_from_the_same_file_in_any_folder(scenes: tuple[str, str]) -> None:
     (run,) = planned(f"--scenes={scenes[0]}", "--model.init_from=a/scene.ply")
     assert yaml.safe_load(run.config)["model"]["init_from"] == str(Path("a/scene.ply").absolute())
+    (run,) = planned("--data.root=~/fox")
+    assert yaml.safe_load(run.config)["data"]["init_args"]["root"] == str(Path.home() / "fox")
 
 
 def test_without_codebooks_there_is_one_run(scenes: tuple[str, str]) -> None:
