@@ -281,16 +281,6 @@ def _signs(axes: str, sh_degree: int) -> tuple[Float32s, Float32s, Float32s]:
     return xyz, np.array([1, *(xyz.prod() * xyz)], np.float32), harmonics.repeat(3)
 
 
-def _in_file_order(scene: CompressedScene) -> CompressedScene:
-    """The splats that a file holds, in its order: by their codes, then by position.
-
-    The codes of the spherical harmonics come first: in both versions, equal rows compress best when close together.
-    """
-    scene = scene.in_morton_order()
-    codes = [scene.codes[name] for name in QUANTIZABLE if name in scene.codes]  # shN, the last, sorts first
-    return scene.in_order(np.lexsort([np.arange(len(scene)), *codes]))
-
-
 # Versions that are written; every reader of the format supports the default.
 SPZ_VERSIONS = (3, 4)
 DEFAULT_VERSION = 3
@@ -323,7 +313,11 @@ def write_spz(
         raise ValueError(f"version of .spz must be {' or '.join(map(str, SPZ_VERSIONS))}, got {version}")
     if axes not in SPZ_AXES:
         raise ValueError(f"axes of .spz must be {' or '.join(SPZ_AXES)}, got {axes!r}")
-    scene = _in_file_order(scene)
+    # By their codes, then by position. Those of the spherical harmonics, the last, sort first: equal rows compress best
+    # when close together.
+    scene = scene.in_morton_order()
+    codes = [scene.codes[name] for name in QUANTIZABLE if name in scene.codes]
+    scene = scene.in_order(np.lexsort([np.arange(len(scene)), *codes]))
     clamped = Clamped()
     xyz, quats, harmonics = _signs(axes.upper(), scene.sh_degree)
     fraction = _fraction_bits(scene)
@@ -398,14 +392,17 @@ def read_spz(path: StrPath) -> CompressedScene:
     levels = np.minimum(arrays["opacities"].astype(np.uint16) * factor, 255).astype(np.uint8)
     system = header.system or _SYSTEMS.index(DEFAULT_AXES.upper()) + 1
     xyz, quats, harmonics = _signs(_SYSTEMS[(system - 1) % 8], degree)
+    shN = arrays["shN"][:, : len(harmonics)].astype(np.float32)
+    shN -= 128
+    shN *= harmonics / 128  # powers of two
     scene = CompressedScene.from_rows(
         {
             "means": _unpacked_means(header, arrays["means"]) * xyz,
             "quats": _unpacked_quats(header, arrays["quats"]) * quats,
             "scales": arrays["scales"].astype(np.float32) / 16 - 10,
             "opacities": logits_of_bytes(levels),
-            "sh0": ((np.arange(256) / 255 - 0.5) / _COLOR).astype(np.float32)[arrays["sh0"]],
-            "shN": _unpacked_harmonics(arrays["shN"], harmonics),
+            "sh0": (arrays["sh0"] / 255 - 0.5) / _COLOR,
+            "shN": shN,
         },
         antialiased=bool(header.flags & ANTIALIASED),
     )
@@ -423,12 +420,6 @@ def _unpacked_means(header: SpzHeader, data: Uint8s) -> NDArray[np.floating[Any]
     wide = np.zeros((header.count, 3, 4), np.uint8)
     wide[:, :, 1:] = data.reshape(header.count, 3, 3)
     return (wide.view("<i4")[:, :, 0] >> 8).astype(np.float32) / (1 << header.fraction_bits)  # exact
-
-
-def _unpacked_harmonics(data: Uint8s, signs: Float32s) -> Float32s:
-    rows = data[:, : len(signs)].astype(np.float32)
-    rows -= 128
-    return np.multiply(rows, signs / 128, out=rows)  # powers of two
 
 
 def _unpacked_quats(header: SpzHeader, data: Uint8s) -> Float32s:

@@ -67,13 +67,6 @@ def sort_into_leaves(codebook: Array) -> Array:
     return order
 
 
-def _points(codebook: Array) -> Array:
-    """Columns ``[D, K]`` of the codes; those with a NaN lie at infinity and are never chosen."""
-    points = np.ascontiguousarray(codebook.T)
-    points[np.isnan(points)] = np.inf
-    return points
-
-
 @parallel
 def _pack(node, _, points, order, codes, labels, leaves, nodes):
     """Put codes and the corners of their boxes into the arrays of :func:`_boxes`."""
@@ -113,7 +106,9 @@ def _boxes(codebook: Array, order: Array) -> tuple[Array, ...]:
         aligned_empty((nodes, dim, 2, 16)),
         aligned_empty((nodes // 16, dim, 2, 16)),
     )
-    _pack(nodes, _points(codebook), order, *tree)
+    points = np.ascontiguousarray(codebook.T)
+    points[np.isnan(points)] = np.inf  # where no code is chosen
+    _pack(nodes, points, order, *tree)
     return tuple(array.ravel() for array in tree)
 
 

@@ -73,14 +73,6 @@ def tile_index(x, y, group_columns):
 
 
 @inline
-def tile_range(boxes, place):
-    """First column and row of a box, and its end column and row (exclusive)."""
-    box = np.int64(get(boxes, place))
-    x, y = box & 0xFFFF, (box >> 16) & 0xFFFF
-    return x, y, x + ((box >> 32) & 0xFFFF), y + (box >> 48)
-
-
-@inline
 def _visit_tiles(part, parts, count, order, boxes, group_columns, histogram, ids, entries):
     """Count the splats of every tile; or write their rows (``ids``, by place) into its list, keeping the order."""
     row = histogram[part]
@@ -94,10 +86,11 @@ def _visit_tiles(part, parts, count, order, boxes, group_columns, histogram, ids
             if entries is not None:
                 prefetch(ids, coming)
         place = np.int64(get(order, i))
-        x0, y0, x1, y1 = tile_range(boxes, place)
+        box = np.int64(get(boxes, place))
+        x0, y0, columns, rows = box & 0xFFFF, (box >> 16) & 0xFFFF, (box >> 32) & 0xFFFF, box >> 48
         splat_row = None if entries is None else get(ids, place)
-        for y in range(y0, y1):
-            for x in range(x0, x1):
+        for y in range(y0, y0 + rows):
+            for x in range(x0, x0 + columns):
                 tile = tile_index(x, y, group_columns)
                 entry = get(row, tile)
                 put(row, tile, entry + 1)

@@ -69,18 +69,6 @@ def in_tile(records, r, corner):
     return x, y, (a, b, c, -(a * x + b * y), -(c * y))
 
 
-@inline
-def highest_exponent(a, b, c, slope_x, slope_y, left, right, top, bottom):
-    """Largest value of -(u² + v²) on rectangles relative to the splat's centre: it lies on the edges facing it."""
-    dx = simd.maximum(left, simd.minimum(right, 0))
-    dy = simd.maximum(top, simd.minimum(bottom, 0))
-    along_y = simd.maximum(top, simd.minimum(bottom, slope_x * dx))
-    along_x = simd.maximum(left, simd.minimum(right, slope_y * dy))
-    first, _, _ = exponent(a, b, c, 0, 0, 0, dx, along_y)
-    second, _, _ = exponent(a, b, c, 0, 0, 0, along_x, dy)
-    return simd.maximum(first, second)
-
-
 # How far below the threshold, in log2 α, a block still counts as reached: what rounding can add to the exponent of a
 # pixel, so that culling blocks changes no bit. It lets one block in a thousand more through.
 REACH_MARGIN = F(2.0**-8)
@@ -91,11 +79,16 @@ def reachable_blocks(batch, o, x, y, grid):
     """Mask of the blocks of a tile in which a splat can reach α = 1/255."""
     left = simd.load(grid, 512) - x
     top = simd.load(grid, 528) - y
-    side = F(BLOCK_SIDE - 1)
+    right, bottom = left + F(BLOCK_SIDE - 1), top + F(BLOCK_SIDE - 1)
+    # The largest value of -(u² + v²) on a block lies on the edges that face the splat's centre.
+    dx = simd.maximum(left, simd.minimum(right, 0))
+    dy = simd.maximum(top, simd.minimum(bottom, 0))
+    along_y = simd.maximum(top, simd.minimum(bottom, simd.get(batch, o + rec.SLOPE_X) * dx))
+    along_x = simd.maximum(left, simd.minimum(right, simd.get(batch, o + rec.SLOPE_Y) * dy))
     a, b, c = rec.get3(batch, o + rec.A)
-    slope_x = simd.get(batch, o + rec.SLOPE_X)
-    slope_y = simd.get(batch, o + rec.SLOPE_Y)
-    peak = highest_exponent(a, b, c, slope_x, slope_y, left, left + side, top, top + side)
+    first, _, _ = exponent(a, b, c, 0, 0, 0, dx, along_y)
+    second, _, _ = exponent(a, b, c, 0, 0, 0, along_x, dy)
+    peak = simd.maximum(first, second)
     return simd.mask_bits(peak >= formulas.LOG2_ALPHA_MIN - REACH_MARGIN - simd.get(batch, o + rec.LOG2_OPACITY))
 
 

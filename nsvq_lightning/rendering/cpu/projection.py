@@ -14,13 +14,6 @@ PROJECTION_SCRATCH = 128 + 16 * rec.RECORD
 
 
 @inline
-def load_screen(camera):
-    """The screen of :func:`nsvq_lightning.rendering.formulas.footprint`."""
-    width, height, near = rec.get3(camera, rec.WIDTH)
-    return simd.get(camera, rec.CX), simd.get(camera, rec.CY), width, height, near
-
-
-@inline
 def project_range(camera, sampling, means, quats, scales, logits, first, last, records, integers, ids):
     """Write the records of a range's visible splats; returns how many there are and how many slots they need.
 
@@ -45,7 +38,8 @@ def project_range(camera, sampling, means, quats, scales, logits, first, last, r
             nearest = load_numbers(sampling[0], start, count)
             farthest = load_numbers(sampling[1], start, count)
             trained_at = nearest, farthest, sampling[2]
-        seen, record, corner, end, radius = footprint(view, load_screen(camera), point, quat, scale, logit, trained_at)
+        screen = simd.get(camera, rec.CX), simd.get(camera, rec.CY), *rec.get3(camera, rec.WIDTH)
+        seen, record, corner, end, radius = footprint(view, screen, point, quat, scale, logit, trained_at)
         bits = simd.mask_bits(seen) & lanes
         if bits == 0:
             continue

@@ -110,16 +110,6 @@ class _Frame:
 _GRID = blending.pixel_grid()
 
 
-def _check_kept(attributes: tuple[Tensor, ...], shapes: tuple[tuple[int, ...], ...]) -> None:
-    """Refuse attributes whose data were replaced since the forward pass, which autograd does not notice."""
-    for name, tensor, shape in zip(ATTRIBUTES, attributes, shapes, strict=False):
-        if tensor.shape != shape:
-            raise ValueError(
-                f"{name} had shape {list(shape)} when it was rendered and {list(tensor.shape)} in the backward pass; "
-                "add or remove splats only after it"
-            )
-
-
 class _Project(torch.autograd.Function):
     """Raw attributes to projected centres; the records travel in the frame, and the token links the graph."""
 
@@ -141,7 +131,12 @@ class _Project(torch.autograd.Function):
             # Only the centres were differentiated, so no blend has written sums.
             frame.clear_sums()
         g_means2d = torch.zeros(frame.n, 2) if g_means2d is None else g_means2d
-        _check_kept(ctx.saved_tensors, ctx.shapes)
+        for name, tensor, shape in zip(ATTRIBUTES, ctx.saved_tensors, ctx.shapes, strict=False):
+            if tensor.shape != shape:  # its data were replaced, which autograd does not notice
+                raise ValueError(
+                    f"{name} had shape {list(shape)} when it was rendered and {list(tensor.shape)} in the backward "
+                    "pass; add or remove splats only after it"
+                )
         gradients = [recycled(shape) for shape in ctx.shapes]
         projection_backward.project_backward(
             frame.parts, frame.camera, frame.sampling, frame.geometry, frame.colors[1], frame.bands, frame.ids,
