@@ -220,7 +220,6 @@ class Compressor:
             names = plain or ["position", "opacity"]
             coarser = {name: float(f"{times * getattr(precision, name):.3g}") for name in names}
             precision = replace(precision, **coarser)
-            scene = replace(scene, config={**scene.config, "precision": coarser})
         return Candidate(setting, b"".join(frame(*encode(scene, replace(self.storage, precision=precision)))))
 
     def _row_weights(self, setting: Setting) -> Tensor:

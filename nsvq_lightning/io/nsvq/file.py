@@ -10,7 +10,7 @@ from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import Bytes, FormatError, naming_file
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry, frame, unframe
-from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
+from nsvq_lightning.io.nsvq.precision import LEVELS, Precision, Storage
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, listed
 from nsvq_lightning.splats.conventions import Float32s, Integers, Uint32s
 
@@ -32,6 +32,9 @@ def encode(scene: CompressedScene, storage: Storage) -> tuple[Header, dict[str, 
     if storage.level == "compact":
         from nsvq_lightning.io.nsvq.compact import encode_compact
 
+        told = {name: each for name, each in vars(storage.precision).items() if each != getattr(Precision, name)}
+        if told or "precision" in scene.config:
+            scene = replace(scene, config={**scene.config, "precision": told})
         return encode_compact(scene, storage.precision)
     return encode_paper(scene)
 

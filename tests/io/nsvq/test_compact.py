@@ -44,7 +44,9 @@ def test_errors_stay_within_the_precision(tmp_path: Path, sizes: dict[str, int])
     precision = Precision(position=0.1, opacity=1 / 64, scales=0.05, quats=0.01, sh0=0.02, shN=0.005)
     assert write_nsvq(path, original, Storage(precision=precision)) == path.stat().st_size
     read = read_nsvq(path)
-    assert (read.config, read.metrics, read.origin) == (original.config, original.metrics, original.origin)
+    told = {name: value for name, value in vars(precision).items() if name != "codebook"}  # that is the default
+    assert read.config == original.config | {"precision": told}
+    assert (read.metrics, read.origin) == (original.metrics, original.origin)
     assert read.stored_bytes == path.stat().st_size
     before, after = arrays_of(original), arrays_of(read)
     rows = matched(before, after)
@@ -65,16 +67,21 @@ def test_errors_stay_within_the_precision(tmp_path: Path, sizes: dict[str, int])
 
 
 @pytest.mark.parametrize("sizes", [SIZES, {}, {"quats": 1, "scales": 300}])
-def test_a_file_that_is_read_and_written_again_loses_nothing_more(tmp_path: Path, sizes: dict[str, int]) -> None:
+@pytest.mark.parametrize("precision", [Precision(), Precision(position=0.002, opacity=0.0005), Precision(scales=0.1)])
+def test_a_file_that_is_read_and_written_again_loses_nothing_more(
+    tmp_path: Path, sizes: dict[str, int], precision: Precision
+) -> None:
     once, twice = tmp_path / "once.nsvq", tmp_path / "twice.nsvq"
-    write_nsvq(once, scene(3000, sizes))
+    write_nsvq(once, scene(3000, sizes), Storage(precision=precision))
     write_nsvq(twice, read_nsvq(once))
     first, second = arrays_of(read_nsvq(once)), arrays_of(read_nsvq(twice))
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(second, name), getattr(first, name), err_msg=name)
-    # A coarser precision rounds again.
-    write_nsvq(twice, read_nsvq(once), Storage(precision=Precision(position=0.4, opacity=1 / 16)))
-    assert twice.stat().st_size < once.stat().st_size
+    # A coarser precision rounds again, and is told in place of the old one.
+    for coarse in (Precision(position=0.4, opacity=1 / 16, scales=0.2), Precision(position=0.4, scales=0.2)):
+        write_nsvq(twice, read_nsvq(twice), Storage(precision=coarse))
+        assert twice.stat().st_size < once.stat().st_size
+        assert Storage.told(read_nsvq(twice).config).precision == coarse
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])

@@ -235,6 +235,8 @@ def test_cameras_are_kept_with_the_digits_that_count(tmp_path: Path, unit: float
     np.testing.assert_allclose(back.cameras[:, :3], cameras[:, :3], rtol=0, atol=0.01 * unit)
     assert set(back.cameras[:, 3]) == {1235.0}
     assert added < 64 * 35
+    io.write_nsvq(path, replace(scene(30), cameras=1e-4 * cameras[:1] / unit), Storage(level))
+    np.testing.assert_allclose(read_nsvq(path).cameras[:, :3], 1e-4 * cameras[:1, :3] / unit, rtol=0, atol=1e-8)
     io.write_nsvq(tmp_path / "y.nsvq", back, Storage(level))
     np.testing.assert_array_equal(read_nsvq(tmp_path / "y.nsvq").cameras, back.cameras)
 
