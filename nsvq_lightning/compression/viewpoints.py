@@ -182,9 +182,11 @@ def likely_cameras(splats: SplatTensors, count: int, width: int = 560, height: i
     raw = RawSplats(*(tensor.cpu() for tensor in detached(splats)))
     means = raw.means.double().numpy()
     # Small, opaque splats are where the detail is: opacity / size, of a sum of 1 even where all are transparent.
-    weights = torch.softmax(logsigmoid(raw.opacities.double()) - raw.scales.double().mean(1), 0).numpy()
+    sizes = raw.scales.double().mean(1)
+    sizes = sizes.clamp_min(sizes.median() - 5)  # one of no length would be all of the weight
+    weights = torch.softmax(logsigmoid(raw.opacities.double()) - sizes, 0).numpy()
     middle = weights @ means
-    reach = math.sqrt(weights @ ((means - middle) ** 2).sum(1)) or 1.0
+    reach = max(math.sqrt(weights @ ((means - middle) ** 2).sum(1)), math.exp(weights @ sizes.numpy()))
     even = torch.quasirandom.SobolEngine(7, scramble=True, seed=0).draw(5 * count)  # type: ignore[no-untyped-call]
     normal = torch.special.ndtri(even.double().clamp(1e-3, 1 - 1e-3))
     directions = normalize(normal[:, :3]).numpy()
@@ -239,10 +241,10 @@ def _following(splats: RawSplats) -> Callable[[Float64s], Float64s]:
 
 def _size_variances(splats: RawSplats, places: Float64s) -> Float64s:
     """Variance of the logarithm of the splats' sizes in pixels as seen from each place ``[P]``, weighted by opacity."""
-    few = RawSplats(*(spread(tensor, SOME_SPLATS) for tensor in splats))
+    few = RawSplats(*(spread(tensor, SOME_SPLATS).double() for tensor in splats))
     weights = torch.softmax(logsigmoid(few.opacities), 0)
-    sizes = few.scales.mean(1) - torch.cdist(torch.from_numpy(places).float(), few.means).clamp_min(1e-12).log()
-    return ((sizes - (sizes @ weights)[:, None]).square() @ weights).double().numpy()
+    sizes = few.scales.mean(1) - torch.cdist(torch.from_numpy(places), few.means).clamp_min(1e-12).log()
+    return ((sizes - (sizes @ weights)[:, None]).square() @ weights).numpy()
 
 
 @torch.no_grad()

@@ -85,8 +85,8 @@ class Sampling(NamedTuple):
 
         nearest = torch.full_like(means[:, 0], math.inf)
         farthest = torch.zeros_like(nearest)
-        places = torch.from_numpy(cameras[:, :3]).to(means)
-        for place in places:
+        places = torch.from_numpy(cameras[:, :3])
+        for place in places.to(means):
             distance = (means - place).norm(dim=1)
             nearest, farthest = torch.minimum(nearest, distance), torch.maximum(farthest, distance)
         gap = 0.0

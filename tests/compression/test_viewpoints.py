@@ -70,6 +70,19 @@ def test_a_single_splat_one_above_another_and_transparent_ones_have_views(rows: 
     assert all(camera.viewmat.isfinite().all() for camera in likely_cameras(some, 3, 32, 24))
 
 
+def test_a_splat_of_no_length_and_the_place_of_a_scene_change_no_view() -> None:
+    plain = painting()
+    more = [torch.cat([tensor, tensor[:1]]) for tensor in plain]
+    one = RawSplats(*more)._replace(scales=torch.cat([plain.scales, torch.full((1, 3), -20.0)]))
+    away = torch.tensor([3000.0, -2000.0, 1000.0])
+    moved = plain._replace(means=plain.means + away)
+    expected = [eye(camera) for camera in likely_cameras(plain, 5, 64, 48)]
+    apart = [np.std([eye(camera) for camera in likely_cameras(splats, 12, 64, 48)]) for splats in (plain, one)]
+    assert apart[1] > 0.8 * apart[0]
+    found = [eye(camera) - away.numpy() for camera in likely_cameras(moved, 5, 64, 48)]
+    np.testing.assert_allclose(found, expected, atol=0.05)
+
+
 def test_pictures_of_a_scene_are_its_photos() -> None:
     cameras = likely_cameras(painting(), 4, 64, 48)
     scene = own_scene(painting(), cameras)

@@ -102,6 +102,10 @@ def test_the_distances_of_cameras() -> None:
     assert focals == [50, 70]
     alone = Sampling.of(means, cameras[:1])
     torch.testing.assert_close(*alone.distances)
+    many = np.c_[2.0 * np.arange(30), np.zeros((30, 2)), np.full(30, 50.0)]
+    for place in (0.0, 2.0**13):
+        (nearest, _), _ = Sampling.of(torch.tensor([[-5.0, place, place]]), many + np.array([0, place, place, 0]))
+        torch.testing.assert_close(nearest, torch.tensor([3.0]))
 
 
 def test_few_cameras_stand_for_many() -> None:
