@@ -26,6 +26,7 @@ NAME = "lod-meta.json"
 
 # Most splats of the finest level in a leaf, and of any level in a file.
 LEAF, FILE = 1 << 14, 1 << 17
+_ASSET = {"generator": "nsvq-lightning"}
 
 
 def write_lod(
@@ -34,7 +35,7 @@ def write_lod(
     """Write a scene as streamed SOG: ``lod-meta.json`` and, beside it, the folders that it names.
 
     Folders are named after their content, and the index is replaced last: a failed write leaves the old scene whole.
-    Folders that only the old index names are removed.
+    Folders that only the old index names are removed, if it is one of these.
 
     Args:
         path: The ``lod-meta.json``.
@@ -56,7 +57,7 @@ def write_lod(
     tree, leaves = _tree(levels)
     old = []
     with suppress(FileNotFoundError, FormatError):
-        old = _index(target)["filenames"]
+        old = _index(target)["own"]
     make_folder_of(target)
     folders: list[str] = []
     total = 0
@@ -77,18 +78,18 @@ def write_lod(
             folders.append(folder)
     about = {
         "version": 1,
-        "asset": {"generator": "nsvq-lightning"},
+        "asset": _ASSET,
         "count": sum(counts),
         "counts": counts,
         "lodLevels": len(levels),
         "filenames": [f"{folder}/{META}" for folder in folders],
         "tree": tree,
     }
-    index = json.dumps(about, separators=(",", ":"))
-    write_text(target, index)
+    text = json.dumps(about, separators=(",", ":"))
+    write_text(target, text)
     for folder in {name.partition("/")[0] for name in old if name.count("/") == 1}.difference(folders):
         shutil.rmtree(target.parent / folder, ignore_errors=True)
-    return total + len(index)
+    return total + len(text)
 
 
 def _tree(levels: Sequence[CompressedScene]) -> tuple[Json, list[tuple[list[Integers], Json]]]:
@@ -157,7 +158,7 @@ _MAX_BYTES = 1 << 26
 
 
 def _index(path: Path) -> dict[str, list[str]]:
-    """Of ``lod-meta.json``: ``filenames``, and those ``shown``, of the finest level and what surrounds the scene."""
+    """Of ``lod-meta.json``: ``filenames``; those ``shown``, of the finest level and what surrounds the scene; ours."""
     with naming_file(path):
         if path.stat().st_size > _MAX_BYTES:
             raise FormatError(f"damaged: an index cannot have {path.stat().st_size} bytes")
@@ -183,7 +184,7 @@ def _index(path: Path) -> dict[str, list[str]]:
             raise FormatError(f"incomplete: {absent[0]} is missing", "copy the whole folder again")
         if (version := index.get("version", 1)) != 1:  # the first writers stated none
             raise FormatError(f"version {str(version)[:40]} of the format; this release reads version 1")
-    return {"filenames": names, "shown": shown}
+    return {"filenames": names, "shown": shown, "own": names if index.get("asset") == _ASSET else []}
 
 
 def _is_beside(name: PurePosixPath) -> bool:

@@ -85,6 +85,10 @@ def test_a_new_scene_takes_the_place_of_one_that_names_its_folders_otherwise(tmp
     save(plain_scene(30, 1), path)
     assert len(read_scene(path)) == 30
     assert len(list(tmp_path.iterdir())) == 3  # the index, its one folder, and mine
+    (tmp_path / "mine" / "meta.json").touch()
+    path.write_text(json.dumps(index | {"asset": {"generator": "another"}, "filenames": ["mine/meta.json"]}))
+    save(plain_scene(30, 1), path)
+    assert (tmp_path / "mine" / "meta.json").exists()
 
 
 def test_levels_become_coarser(tmp_path: Path) -> None:
