@@ -1,6 +1,7 @@
 """From the file of a photo to the picture that a view is compared with, which is kept while a byte budget lasts."""
 
 import io
+import struct
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ from nsvq_lightning.splats.conventions import Arrays, Bools, Uint8s
 # Pillow refuses twice as many, and by default fewer than phones have.
 PIL.Image.MAX_IMAGE_PIXELS = 1 << 27
 # What Pillow raises for a file that is damaged, not a picture, or beyond that limit.
-DAMAGED = (OSError, ValueError, SyntaxError, KeyError, PIL.Image.DecompressionBombError)
+DAMAGED = (OSError, ValueError, SyntaxError, KeyError, TypeError, struct.error, PIL.Image.DecompressionBombError)
 # EXIF orientations from here on: stored lying on its side, so that programs that apply it swap width and height.
 ON_ITS_SIDE = 5
 
@@ -173,7 +174,8 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bools:
     """Which pixels of a photo count ``[H, W]``: those that are more than half as bright as the brightest.
 
     So white and 1 are kept, in 8 or 16 bits, black is excluded. Where pixels are transparent, that is the mask; in
-    colours, as of labels or of photos cut out, all counts that is not black. A mask of another size is scaled.
+    colours or small numbers, as of labels or of photos cut out, all counts that is not black. A mask of another size is
+    scaled.
 
     Args:
         path: Image file.
@@ -187,9 +189,9 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bools:
     colours = pixels[..., :3]
     levels = colours.max(2)
     black = 1 / 2
-    if pixels.shape[2] == 4 and np.ptp(pixels[..., 3]) > 0:
+    if pixels.shape[2] == 4 and np.ptp(pixels[..., 3]) > pixels[..., 3].max() / 2:
         levels = pixels[..., 3]
-    elif np.ptp(colours, axis=2).max() > levels.max() / 16:
+    elif levels.max() < 32 or np.ptp(colours, axis=2).max() > levels.max() / 16:
         black = 1 / 32  # also after JPEG
     bright = levels > black * levels.max()
     if not same_shape(bright.shape[::-1], size):
@@ -291,7 +293,7 @@ class ImageSource:
             return _turned_back(read_image(self.path), undo), None
         pixels = _to_bytes(_decoded(self.path, cv2.IMREAD_UNCHANGED))
         if pixels.ndim != 3 or pixels.shape[2] != 4:
-            raise _undecodable(self.path, f"its transparency is not understood, its pixels are {pixels.shape[2:]}")
+            raise _undecodable(self.path, "its transparency is not understood: save it as RGB or RGBA")
         pixels = _turned_back(pixels, undo)
         image = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB)
         alpha = pixels[..., 3]

@@ -190,7 +190,7 @@ def find_masks(
         places = [path for path in below if _OF_MASKS.search(path.name) and path.is_dir()]
         places.append(photos)
     found = {place: masks for place in places if any(masks := _masks_in(place, named, files, place == photos))}
-    shown = " and ".join(map(str, found or usual))
+    shown = " and ".join(map(str, found or usual or places[:-1]))
     if len(found) == 1:
         if not usual:
             log.info("masks are read from %s", shown)
@@ -199,7 +199,7 @@ def find_masks(
         return [one or other for one, other in zip(first, second, strict=True)]
     if found:
         log.warning("masks in %s are not used: choose a folder (--data.masks)", shown)
-    elif usual and not has_own:
+    elif shown and not has_own:
         name = Path(relative[0])
         png = name.with_suffix(".png")
         log.warning("%s has no mask of any photo: that of %s would be %s.png or %s", shown, name, name, png)

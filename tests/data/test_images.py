@@ -185,6 +185,9 @@ def _palette(indices: np.ndarray, colours: list[int]) -> PIL.Image.Image:
         PIL.Image.fromarray(np.dstack([RGB, GREY])),
         PIL.Image.fromarray(np.dstack([np.full((6, 9), 255, np.uint8), GREY]), "LA"),
         PIL.Image.fromarray(np.dstack([GREY, GREY, GREY, np.full((6, 9), 255, np.uint8)])),
+        PIL.Image.fromarray(np.dstack([GREY, GREY, GREY, np.arange(202, 256, dtype=np.uint8).reshape(6, 9)])),
+        PIL.Image.fromarray(LABELS.astype(np.uint8)),
+        PIL.Image.fromarray(LABELS.astype(np.uint16)),
         PIL.Image.fromarray(np.maximum(RGB, 40) * KEPT[..., None].astype(np.uint8)),
     ],
 )

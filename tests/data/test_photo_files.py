@@ -132,6 +132,9 @@ def test_masks_that_are_not_clear_are_named(tmp_path: Path, caplog: pytest.LogCa
     assert "white leaves out in them" in caplog.text
     assert masks_of(tmp_path, "missing", "1.jpg") == [None]
     assert "there is no folder" in caplog.text
+    write(tmp_path, "foreground_mask/one.png")
+    assert masks_of(tmp_path, "masks", "1.jpg") == [None]
+    assert f"{tmp_path / 'foreground_mask'} has no mask of any photo: that of 1.jpg would be" in caplog.text
     write(tmp_path, "masks/1.png", "masks/1.jpg")
     with pytest.raises(SceneError, match=r"1\.jpg and .*1\.png are masks of 1\.jpg: remove one"):
         masks_of(tmp_path, "masks", "1.jpg")
