@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import os
+import re
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +65,16 @@ def test_still_parts_are_left_out_and_short_videos_give_what_they_have(
     assert len(write_frames(video, tmp_path, parts, _silent)) == frames
 
 
+def test_a_video_that_was_cut_short_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    video = _video(tmp_path / "a.avi", [_texture(20 * k) for k in range(24)])
+    for parts in (1, 4, 24):
+        assert len(write_frames(video, tmp_path, parts, _silent)) == parts
+    assert not caplog.messages
+    video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+    assert 1 < len(write_frames(video, tmp_path, 12, _silent)) < 9
+    assert re.search(r"a\.avi ends near frame 1?\d of 24: copy it again", caplog.text)
+
+
 def test_what_is_no_video_is_told(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(b"nothing")
     with pytest.raises(SceneError, match=r"a\.mp4: no frame can be read; convert it"):
@@ -97,6 +109,29 @@ def test_photos_are_turned_upright(folders: tuple[Path, Path], orientation: int,
     if suffix != "webp":
         as_it_was = (target / name).read_bytes() == (source / f"a.{suffix}").read_bytes()
         assert as_it_was == (orientation == 1)
+
+
+def _tag(number: int, kind: int, count: int, value: bytes) -> bytes:
+    return struct.pack(">HHI4s", number, kind, count, value)
+
+
+# A unit and a resolution as text, which Pillow cannot write; an entry of the camera that leads nowhere.
+ODD = {
+    "unit": [_tag(0x0112, 3, 1, b"\0\6"), _tag(0x0128, 2, 2, b"2")],
+    "resolution": [_tag(0x0112, 3, 1, b"\0\6"), _tag(0x011A, 2, 3, b"72")],
+    "nowhere": [_tag(0x0112, 3, 1, b"\0\6"), _tag(0x8769, 4, 1, b"\0\1")],
+}
+
+
+@pytest.mark.parametrize("name", [*ODD, "none"])
+def test_photos_with_odd_tags_are_copied(folders: tuple[Path, Path], name: str) -> None:
+    tags = ODD.get(name, [])
+    head = b"MM\0*\0\0\0\x08" + struct.pack(">H", len(tags)) + b"".join(tags) + bytes(4)
+    source, target = folders
+    PIL.Image.fromarray(_texture()).save(source / "a.jpg", exif=b"Exif\0\0" + (head if tags else b"garbage!"))
+    assert _copied(source, target) == ["a.jpg"]
+    assert image_head(target / "a.jpg").size == ((96, 192) if tags else (192, 96))
+    assert [reconstruct._lens_of(folder / "a.jpg") for folder in folders] == ["[None, None, None]"] * 2
 
 
 def _written(path: Path) -> np.ndarray[Any, Any]:
