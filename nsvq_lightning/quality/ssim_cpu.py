@@ -59,16 +59,6 @@ def blur_along(row, o):
 
 
 @inline
-def add_pair(images, y, distance, x, pitch, tap, sums):
-    """Add the moments of the rows ``distance`` above and below row y, which share a tap."""
-    above = row_of(y - distance, IMAGES, pitch) + x
-    below = row_of(y + distance, IMAGES, pitch) + x
-    p, q = simd.load(images, above), simd.load(images, above + pitch)
-    r, s = simd.load(images, below), simd.load(images, below + pitch)
-    return formulas.add_moments(sums, tap, p, q, r, s)
-
-
-@inline
 def moments_of_row(images, y, length, pitch, moments):
     """Vertical blur of the four moment planes at row y."""
     for x_ in range(0, length, 16):
@@ -76,7 +66,12 @@ def moments_of_row(images, y, length, pitch, moments):
         o = row_of(y, IMAGES, pitch) + x
         sums = formulas.moments(TAPS[0], simd.load(images, o), simd.load(images, o + pitch))
         for distance in range(1, SSIM_RADIUS + 1):
-            sums = add_pair(images, y, distance, x, pitch, TAPS[distance], sums)
+            # The rows above and below share a tap.
+            above = row_of(y - distance, IMAGES, pitch) + x
+            below = row_of(y + distance, IMAGES, pitch) + x
+            p, q = simd.load(images, above), simd.load(images, above + pitch)
+            r, s = simd.load(images, below), simd.load(images, below + pitch)
+            sums = formulas.add_moments(sums, TAPS[distance], p, q, r, s)
         for plane in range(MOMENTS):
             simd.store(moments, plane * pitch + PAD + x, sums[plane])
 
