@@ -129,6 +129,7 @@ class Scene:
         frame: Coordinates that it is trained in.
         split: Which views are the test views, in words.
         white: Whether the photos show objects in front of white, as those of NeRF-synthetic scenes do.
+        random: Whether the points are random ones, as there are none of SfM.
     """
 
     root: Path
@@ -143,6 +144,7 @@ class Scene:
     frame: Frame = Frame()  # noqa: RUF009  frozen
     split: str = "every 8th by name"
     white: bool = False
+    random: bool = False
 
     def __len__(self) -> int:
         return len(self.names)
@@ -268,7 +270,8 @@ def load_scene(
     poses, frame = _framed(poses, root, origin)
     pairs = zip(poses.images, sources, strict=True)
     cameras = tuple(_camera(image, source.pinhole, frame) for image, source in pairs)
-    if not len(poses.points):
+    random = not len(poses.points)
+    if random:
         points = random_points([cameras[index] for index in train])
         log.info("%s has no points: %d random ones in what the cameras see take their place", root, len(points))
         poses = replace(poses, points=points, colors=np.full_like(points, 128, np.uint8))
@@ -297,6 +300,7 @@ def load_scene(
         frame=frame,
         split=split,
         white=poses.synthetic and (transparent or float(images[0].image[0].float().mean()) > 127),
+        random=random,
     )
 
 

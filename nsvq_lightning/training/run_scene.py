@@ -140,7 +140,7 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
     scene = needed_scene(trainer, "no splats to start from", "set init_from").standard
     if count is None:
         return Splats.from_points(scene.points, scene.colors, sh_degree)
-    points, colors = _with_dense_points(scene, count - len(scene.points), seed)
+    points, colors = _with_dense_points(scene, count, seed)
     points, colors = (torch.cat(parts) for parts in zip((points, colors), far_points(scene, points), strict=True))
     splats = Splats.from_points(points, colors, sh_degree, FIRST_OPACITY)
     cameras = scene.train_cameras
@@ -150,18 +150,24 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
     return splats
 
 
-def _with_dense_points(scene: Scene, missing: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Positions and colours ``[P, 3]`` of the points of SfM and of so many more."""
-    if missing <= 0:
+def _with_dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Positions and colours ``[P, 3]`` of the points of SfM and, up to ``count``, of the dense start.
+
+    Random ones stay only where that finds too few, or photos are white around their objects.
+    """
+    fills = scene.random and not scene.white
+    known = 0 if fills else len(scene.points)
+    if count <= known:
         return scene.points, scene.colors
-    log.info("dense start: looking for %d points that neighbouring photos show, beside those of SfM", missing)
-    start, known = time.perf_counter(), len(scene.points)
-    points, colors = dense_points(scene, missing, seed)
+    log.info("dense start: looking for %d points that neighbouring photos show", count - known)
+    start = time.perf_counter()
+    points, colors = dense_points(scene, count - known, seed)
     trim()
     log.info("dense start: %d points beside %d of SfM, %.1f s", len(points), known, time.perf_counter() - start)
     if len(points) == 0:
-        log.warning("neighbouring photos show nothing that could be followed: training starts from SfM's points")
-    return torch.cat([scene.points, points]), torch.cat([scene.colors, colors])
+        log.warning("neighbouring photos show nothing that could be followed: training starts from the points of the scene")
+    order = slice(None, None, -1 if fills else 1)
+    return torch.cat([scene.points, points][order])[:count], torch.cat([scene.colors, colors][order])[:count]
 
 
 def background_of(scene: Scene, asked: str) -> str:

@@ -19,6 +19,7 @@ from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.rendering.frame import EXTENT, Frame
 from nsvq_lightning.splats.splats import Splats
+from nsvq_lightning.training import run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.run_scene import background_of, extent_of, first_splats, needed_scene, scene_of
@@ -55,6 +56,22 @@ def test_transparent_photos_are_not_trained_on_black() -> None:
     for asked in ("black", "random"):
         with pytest.raises(ValueError, match=f"lego are white .* model.background is {asked}: leave it at auto"):
             background_of(scene, asked)
+
+
+@pytest.mark.parametrize(
+    ("random", "white", "found", "first"),
+    [(False, False, 99, "abbb"), (True, False, 99, "bbbb"), (True, True, 99, "abbb"), (True, False, 20, "bbaa")],
+)
+def test_random_points_only_fill_up_what_photos_show(
+    monkeypatch: pytest.MonkeyPatch, random: bool, white: bool, found: int, first: str
+) -> None:
+    """Of 40 points, tens that are given (a) or from the flow between photos (b)."""
+    given = torch.zeros(30 if random and not white else 10, 3)
+    monkeypatch.setattr(run_scene, "dense_points", lambda _, count, __: (torch.ones(min(count, found), 3),) * 2)
+    scene: Any = SimpleNamespace(points=given, colors=given, random=random, white=white)
+    for each in run_scene._with_dense_points(scene, 40, 0):
+        assert "".join("ab"[int(x)] for x in each[::10, 0]) == first
+        assert len(each) == 40
 
 
 def test_a_lone_point_before_the_cameras_does_not_hide_the_scene(make_scene: Callable[..., Path]) -> None:
