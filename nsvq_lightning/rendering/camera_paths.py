@@ -215,7 +215,7 @@ def _times_smaller(arguments: str, width: int) -> float:
     """How many times smaller than the photos, ``width`` pixels wide, INRIA's trainer was asked to train them."""
     found = re.search(r"\bresolution=(-?\d+)", arguments)
     asked = int(found[1]) if found else -1
-    folder = re.search(r"\bimages='[^']*_(\d+)'", arguments)
+    folder = re.search(r"\bimages='[^']*_([248])'", arguments)
     smaller = int(folder[1]) if folder else 1
     if asked in (1, 2, 4, 8):
         return smaller * asked

@@ -213,7 +213,7 @@ def test_cameras_of_inrias_trainer(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "times"),
-    [(None, 2), ("-1", 2), ("1", 1), ("8", 8), ("800", 4), ("0", 2), ("-1, images='images_4'", 4)],
+    [(None, 2), ("-1", 2), ("1", 1), ("8", 8), ("800", 4), ("0", 2), ("-1, images='i_4'", 4), ("1, images='a_24'", 1)],
 )
 def test_cameras_of_inrias_trainer_have_the_size_it_trained(
     tmp_path: Path, arguments: str | None, times: float
