@@ -216,7 +216,7 @@ def _times_smaller(arguments: str, width: int) -> float:
     found = re.search(r"\bresolution=(-?\d+)", arguments)
     asked = int(found[1]) if found else -1
     folder = re.search(r"\bimages='[^']*_([248])'", arguments)
-    smaller = int(folder[1]) if folder else 1
+    smaller = float(folder[1]) if folder else 1.0
     if asked in (1, 2, 4, 8):
         return smaller * asked
     return width / asked if asked > 0 else max(smaller, width / 1600)

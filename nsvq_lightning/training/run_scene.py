@@ -165,7 +165,7 @@ def _with_dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Ten
     trim()
     log.info("dense start: %d points beside %d of SfM, %.1f s", len(points), known, time.perf_counter() - start)
     if len(points) == 0:
-        log.warning("neighbouring photos show nothing that could be followed: training starts from other points")
+        log.warning("photos show nothing that could be followed: training starts from SfM's points, or random ones")
     order = slice(None, None, -1 if fills else 1)
     return torch.cat([scene.points, points][order])[:count], torch.cat([scene.colors, colors][order])[:count]
 

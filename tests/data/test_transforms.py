@@ -143,9 +143,7 @@ def test_copies_of_another_size_are_not_those_of_another_scene(make_scene: Scene
     assert half.view(3).image.shape == (16, 20, 3)
 
 
-def test_masks_beside_photos_elsewhere_are_not_looked_for(
-    make_scene: SceneFactory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_masks_beside_photos_elsewhere_are_not_looked_for(make_scene: SceneFactory, tmp_path: Path) -> None:
     root = write_pinhole(make_scene(), tmp_path / "project" / "photos")
     export = tmp_path / "project" / "export" / "transforms.json"
     export.parent.mkdir()

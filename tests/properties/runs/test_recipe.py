@@ -128,7 +128,7 @@ def test_where_flow_finds_nothing_the_run_starts_from_sfm(
     monkeypatch.setattr("nsvq_lightning.training.run_scene.dense_points", lambda *_: (nothing, nothing))
     _, module = run(recipe(budget=SplatBudget(splats=2000), density=None).values(), max_steps=1)
     assert len(module.splats) > 0
-    assert "training starts from other points" in caplog.text
+    assert "training starts from SfM's points" in caplog.text
 
 
 def test_a_resumed_run_looks_for_no_points(
