@@ -318,6 +318,10 @@ def _near(means: Arrays) -> tuple[Arrays, tuple[float, float, float]]:
 def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, Arrays]:
     """Rows ``[N, D]`` of each attribute."""
     columns = _needed(header, sh_degree)
+    known = {*chain(*columns.values()), *_UNUSED, *_RGB, "alpha", "filter_3D"}
+    if others := [name for name in header.properties if name not in known]:
+        shown = " ".join(others[:5])
+        log.warning("%s: %d other properties are left out (%s): splats that move stand still", path, len(others), shown)
     # A third scale that is not there stays flat.
     rows = {name: np.full((header.count, dim), FLAT, np.float32) for name, dim in attribute_dims(sh_degree).items()}
     kind = np.float64 if header.dtype["x"].itemsize == 8 else np.float32  # of positions on a map

@@ -65,7 +65,9 @@ def test_written_bytes_are_the_layout_of_the_authors(tmp_path: Path, degree: int
     assert_same(read_ply(path), splats)
 
 
-def test_any_order_type_and_byte_order_and_further_properties_and_elements(tmp_path: Path) -> None:
+def test_any_order_type_and_byte_order_and_further_properties_and_elements(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     splats, path = scene(6, 1), tmp_path / "x.ply"
     names = sorted(_names(1), reverse=True)
     kinds = ["double" if i % 2 else "float32" for i in range(len(names))]
@@ -79,7 +81,9 @@ def test_any_order_type_and_byte_order_and_further_properties_and_elements(tmp_p
         before = "comment made elsewhere\nelement camera 2\nproperty int id\nproperty uint8 kind\n"
         head = _header(properties, 6, encoding, before).replace(b"\n", b"\r\n")
         path.write_bytes(head + bytes(10) + b"".join(rows) + b"more elements")
+        caplog.clear()
         assert_same(read_ply(path), splats)
+        assert f"{path}: 1 other properties are left out (label): " in caplog.text
 
 
 def test_ascii(tmp_path: Path) -> None:
