@@ -274,7 +274,7 @@ class SplatModule(LightningModule):
                 make = partial(run_scene.first_splats, self.trainer, degree, self.first_points, self.seed)
                 self.active_sh_degree = 0
             else:
-                make = partial(run_scene.splats_of_file, self.init_from, self.frame, degree)
+                make = partial(run_scene.splats_of_file, self.init_from, self.scene)
                 self.active_sh_degree = degree
             self.splats = distributed.on_first_process(self.trainer, make).to(self.device)
         run_scene.warn_of_others(self.trainer, self.splats.means)

@@ -15,7 +15,7 @@ from nsvq_lightning.data.dense_start import dense_points, far_points
 from nsvq_lightning.data.scene import ONE_PLACE, Scene, View, check_cameras, spread
 from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.random import generator
-from nsvq_lightning.rendering.frame import EXTENT, Frame
+from nsvq_lightning.rendering.frame import EXTENT
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.importance import contributions, sensitivity
@@ -99,17 +99,23 @@ def extent_of(trainer: Trainer) -> float:
     return EXTENT
 
 
-def splats_of_file(path: str, frame: Frame, sh_degree: int) -> Splats:
-    """The splats of a scene file of any format in a frame, without non-finite ones.
+def splats_of_file(path: str, trained: SplatScene) -> Splats:
+    """The splats of a scene file of any format, without non-finite ones, in the frame of a run that starts from them.
 
     Raises:
         ValueError: They have another SH degree.
     """
-    scene = read_scene(path).relative_to(frame.origin)
-    if scene.sh_degree != sh_degree:
-        degree = scene.sh_degree
-        raise ValueError(f"{path} has SH degree {degree}, the module {sh_degree}; set sh_degree={degree}")
-    return Splats.from_tensors(*frame.splats(scene.decode()))
+    scene = read_scene(path).relative_to(trained.frame.origin)
+    degree = scene.sh_degree
+    if degree != trained.splats.sh_degree:
+        raise ValueError(
+            f"{path} has SH degree {degree}, the module {trained.splats.sh_degree}; set sh_degree={degree}"
+        )
+    for name in "antialiased", "background":
+        was, now = scene.config.get(name), getattr(trained, name)
+        if was not in (None, now):
+            log.warning("%s was trained with %s=%s, this run has %s: it looks different at first", path, name, was, now)
+    return Splats.from_tensors(*trained.frame.splats(scene.decode()))
 
 
 def warn_of_others(trainer: Trainer, means: Tensor) -> None:

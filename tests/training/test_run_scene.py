@@ -16,6 +16,7 @@ from splat_scenes import random_splats
 
 from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.rendering.frame import EXTENT, Frame
 from nsvq_lightning.splats.splats import Splats
@@ -123,3 +124,15 @@ def test_a_run_can_start_from_a_file(demo_scene: Path, tmp_path: Path, caplog: p
     wrong = SplatModule(sh_degree=2, codebooks=None, init_from=str(tmp_path / "start.ply"))
     with pytest.raises(ValueError, match="set sh_degree=1"):
         fit(wrong, data, [PhaseSchedule()], 1)
+
+
+def test_a_start_that_was_trained_to_look_otherwise_is_told(
+    demo_scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path, data = tmp_path / "start.ply", ColmapDataModule(str(demo_scene), factor=4)
+    save(CompressedScene.from_splats(random_splats(30, sh_degree=1), antialiased=True), path)
+    for antialiased in (True, False):
+        settings = {"sh_degree": 1, "codebooks": None, "antialiased": antialiased}
+        fit(SplatModule(**settings, init_from=str(path)), data, [PhaseSchedule()], 1)
+        told = f"{path} was trained with antialiased=True, this run has False: it looks different at first"
+        assert (told in caplog.text) is not antialiased
