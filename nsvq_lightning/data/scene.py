@@ -129,7 +129,8 @@ class Scene:
         frame: Coordinates that it is trained in.
         split: Which views are the test views, in words.
         white: Whether the photos show objects in front of white, as those of NeRF-synthetic scenes do.
-        random: Whether the points are random ones, as there are none of SfM.
+        grey: Whether the points have no colours: random ones, as there are none of SfM, or those of a program that does
+            not look at the photos. They are grey then, as a splat that starts black stays black.
     """
 
     root: Path
@@ -144,7 +145,7 @@ class Scene:
     frame: Frame = Frame()  # noqa: RUF009  frozen
     split: str = "every 8th by name"
     white: bool = False
-    random: bool = False
+    grey: bool = False
 
     def __len__(self) -> int:
         return len(self.names)
@@ -268,12 +269,15 @@ def load_scene(
         mask_files = find_masks(poses.images, files, folder, root, mask_folders)
     sources = _image_sources(poses, files, mask_files, divisor, max_width if factor is None else None)
     poses, frame = _framed(poses, root, origin)
-    pairs = zip(poses.images, sources, strict=True)
-    cameras = tuple(_camera(image, source.pinhole, frame) for image, source in pairs)
-    random = not len(poses.points)
-    if random:
-        points = random_points([cameras[index] for index in train])
-        log.info("%s has no points: %d random ones in what the cameras see take their place", root, len(points))
+    cameras = tuple(_camera(image, source.pinhole, frame) for image, source in zip(poses.images, sources, strict=True))
+    grey = len(np.unique(poses.colors)) < 2
+    if grey:
+        points = poses.points
+        if len(points):
+            log.info("the points of %s have no colours: they start grey, behind those that photos show", root)
+        else:
+            points = random_points([cameras[index] for index in train])
+            log.info("%s has no points: %d random ones in what the cameras see take their place", root, len(points))
         poses = replace(poses, points=points, colors=np.full_like(points, 128, np.uint8))
     centres = np.stack([image.centre for image in poses.images])
     extent = EXTENT * frame.unit if np.ptp(centres, axis=0).any() else 0.0
@@ -300,7 +304,7 @@ def load_scene(
         frame=frame,
         split=split,
         white=poses.synthetic and (transparent or float(images[0].image[0].float().mean()) > 127),
-        random=random,
+        grey=grey,
     )
 
 

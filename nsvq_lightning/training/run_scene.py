@@ -159,9 +159,9 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
 def _with_dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     """Positions and colours ``[P, 3]`` of the points of SfM and, up to ``count``, of the dense start.
 
-    Random ones stay only where that finds too few, or photos are white around their objects.
+    Those without colours stay only where that finds too few, or photos are white around their objects.
     """
-    fills = scene.random and not scene.white
+    fills = scene.grey and not scene.white
     known = 0 if fills else len(scene.points)
     if count <= known:
         return scene.points, scene.colors

@@ -148,6 +148,26 @@ def test_points_and_extent(make_scene: SceneFactory) -> None:
     assert scene.extent == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.parametrize("value", [0, 255])
+def test_points_that_have_no_colours_start_grey(
+    make_scene: SceneFactory, caplog: pytest.LogCaptureFixture, value: int
+) -> None:
+    """As those of programs that never look at the photos; a splat that starts black gets no gradient."""
+    caplog.set_level("INFO", logger="nsvq_lightning")
+    model = make_scene() / "sparse" / "0"
+    before = load_scene(model.parents[1])
+    assert not before.grey
+    reconstruction = import_pycolmap().Reconstruction(str(model))
+    for point in reconstruction.points3D.values():
+        point.color = np.full(3, value, np.uint8)
+    reconstruction.write_binary(str(model))
+    scene = load_scene(model.parents[1])
+    assert scene.grey
+    assert torch.equal(scene.points, before.points)
+    assert scene.colors.unique().tolist() == pytest.approx([128 / 255])
+    assert f"the points of {scene.root} have no colours: they start grey" in caplog.text
+
+
 def test_points_at_a_camera_centre_are_left_out(make_scene: SceneFactory, caplog: pytest.LogCaptureFixture) -> None:
     root = make_scene()
     scene = load_scene(root)

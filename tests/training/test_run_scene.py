@@ -60,16 +60,16 @@ def test_transparent_photos_are_not_trained_on_black() -> None:
 
 
 @pytest.mark.parametrize(
-    ("random", "white", "found", "first"),
+    ("grey", "white", "found", "first"),
     [(False, False, 99, "abbb"), (True, False, 99, "bbbb"), (True, True, 99, "abbb"), (True, False, 20, "bbaa")],
 )
-def test_random_points_only_fill_up_what_photos_show(
-    monkeypatch: pytest.MonkeyPatch, random: bool, white: bool, found: int, first: str
+def test_points_without_colours_only_fill_up_what_photos_show(
+    monkeypatch: pytest.MonkeyPatch, grey: bool, white: bool, found: int, first: str
 ) -> None:
     """Of 40 points, tens that are given (a) or from the flow between photos (b)."""
-    given = torch.zeros(30 if random and not white else 10, 3)
+    given = torch.zeros(30 if grey and not white else 10, 3)
     monkeypatch.setattr(run_scene, "dense_points", lambda _, count, __: (torch.ones(min(count, found), 3),) * 2)
-    scene: Any = SimpleNamespace(points=given, colors=given, random=random, white=white)
+    scene: Any = SimpleNamespace(points=given, colors=given, grey=grey, white=white)
     for each in run_scene._with_dense_points(scene, 40, 0):
         assert "".join("ab"[int(x)] for x in each[::10, 0]) == first
         assert len(each) == 40
