@@ -251,11 +251,11 @@ def _image_lines(path: Path) -> Iterator[ImageRow]:
 
 
 def _point_lines(path: Path, tracks: bool) -> Iterator[_Point]:
-    """The points of a text table; one of six numbers is position and colour only."""
+    """The points of a text table; a line of six numbers, or whose first has decimals, has no identifier."""
     for line, text in _lines(path):
         words = text.split()
-        if len(words) == 6:
-            words = [str(line), *words]
-        if len(words) < 7:
+        if len(words) < 6:
             raise ValueError(f"line {line} has {len(words)} words; a point has identifier, position of 3, colour of 3")
+        if len(words) == 6 or _numbers(line, words[:1])[0] % 1:  # DPVO's have an error and a track
+            words = [str(line), *words]
         yield tuple(_numbers(line, [*words[:7], *(words[8::2] if tracks else ())]))

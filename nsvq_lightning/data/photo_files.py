@@ -224,7 +224,8 @@ def _masks_in(
         wanted = [f"{name}.png" for name in names]
         stems = [PurePosixPath(_stem(_key(name))) for name in names]
         wanted += [] if beside else map(str, stems)
-        wanted += [str(stem.with_name(form.format(stem.name))) for stem in stems for form in _MASK_NAMES]
+        whole = map(PurePosixPath, names)  # DSC_0001.jpg.mask.png of RealityScan
+        wanted += [str(name.with_name(form.format(name.name))) for name in (*stems, *whole) for form in _MASK_NAMES]
         fitting = next(filter(None, map(files.nearest, wanted)), [])
         if len(fitting) > 1:
             raise SceneError(f"{fitting[0]} and {fitting[1]} are masks of {names[0]}: remove one of them")

@@ -105,6 +105,8 @@ def _numbers(values: object) -> Float64s:
 
 # Cameras with distortion or without, of k1 to k3, p1 and p2; what is missing of these is 0.
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+# How instant-ngp says that a lens is of another kind.
+_OTHER_LENSES = ("latlong", "equirectangular", "orthographic", "ftheta_p1")
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,8 +158,9 @@ class _Frame:
         if listed.shape != (6,):
             raise self.error("has distortion_params that are not 6 numbers")
         k1, k2, k3, k4, p1, p2 = map(self.number, ("k1", "k2", "k3", "k4", "p1", "p2"), listed)
-        usual = "OPENCV_FISHEYE" if self.values.get("is_fisheye") is True else "OPENCV"
-        model = self.values.get("camera_model", usual)
+        usual = "OPENCV_FISHEYE" if self.values.get("is_fisheye") else "OPENCV"
+        other = (key.upper() for key in _OTHER_LENSES if self.values.get(key))
+        model = next(other, self.values.get("camera_model", usual))
         if model == "OPENCV_FISHEYE" and not (p1 or p2):
             return model, width, height, (*pinhole, k1, k2, k3, k4)
         if model not in _PERSPECTIVE or k4:
@@ -165,7 +168,7 @@ class _Frame:
             raise self.error(
                 f"has camera_model {model}{distorted}, which cannot be read; PINHOLE, OPENCV (k1 to k3, p1, p2) and "
                 "OPENCV_FISHEYE (k1 to k4) can",
-                PANORAMA if model == "EQUIRECTANGULAR" else "export the photos undistorted, as PINHOLE",
+                PANORAMA if model in ("EQUIRECTANGULAR", "LATLONG") else "export the photos undistorted, as PINHOLE",
             )
         distortion = (k1, k2, p1, p2, k3)
         if any(distortion):

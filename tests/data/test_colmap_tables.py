@@ -55,6 +55,16 @@ def test_points_as_text(tmp_path: Path, line: str, tracks: list[int]) -> None:
     assert list(read_points(path).tracks) == [[]]
 
 
+def test_points_as_text_without_identifiers(tmp_path: Path) -> None:
+    """With an error and a track all the same, as DPVO writes them."""
+    path = tmp_path / "points3D.txt"
+    path.write_text("1.5 2 3 10 20 30 0.0 0 0 0 0\n1.000000e+00 2 3 4 10 20 30 0.5 7 1\n")
+    points = read_points(path, tracks=True)
+    assert points.xyz.tolist() == [[1.5, 2, 3], [2, 3, 4]]
+    assert points.rgb.tolist() == [[10, 20, 30], [10, 20, 30]]
+    assert list(points.tracks) == [[0, 0], [7]]
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [

@@ -101,6 +101,8 @@ def test_the_only_folder_that_has_the_photos_is_used(tmp_path: Path, place: str)
         "Masks/{}.JPG.PNG",
         "images/{}_mask.png",
         "images/{}.jpg.png",
+        "images/{}.jpg.mask.png",
+        "mask/{}.JPG_mask.png",
         "images_masks/mask_{}.PNG",
         "images/masks/{}.png",
     ],

@@ -75,6 +75,7 @@ def test_points_are_where_the_cameras_see_them(demo_scene: Path, tmp_path: Path,
          {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k2": 0.01, "k3": 0.002, "k4": 0.001}),
         ("FULL_OPENCV", (0.1, 0, 0.002, 0, 0.01, 0, 0, 0), {"k1": 0.1, "distortion_params": [9, 0, 0.01, 0, 0.002, 0]}),
         ("OPENCV_FISHEYE", (0.05, 0, 0, 0), {"camera_model": None, "is_fisheye": True, "k1": 0.05}),
+        ("OPENCV_FISHEYE", (0.05, 0, 0, 0), {"camera_model": None, "is_fisheye": 1, "k1": 0.05}),
     ],
 )  # fmt: skip
 def test_lenses_are_those_of_colmap(
@@ -223,6 +224,8 @@ def test_a_colmap_model_comes_first_and_any_can_be_chosen(make_scene: SceneFacto
     ("frame", "head", "message"),
     [
         ({}, {"camera_model": "EQUIRECTANGULAR"}, "RECTANGULAR, which cannot .*: cut the panoramas"),
+        ({}, {"latlong": True}, "LATLONG, which cannot .*: cut the panoramas"),
+        ({}, {"ftheta_p0": 0.0, "ftheta_p1": 0.01}, "FTHETA_P1, which cannot .*: export the photos undistorted"),
         ({}, {"k4": 0.1}, "OPENCV and k4 = 0.1, which cannot"),
         ({}, {"fl_x": None, "fl_y": None}, "frame 0 has no focal length"),
         ({}, {"fl_x": -3}, "focal length -3"),
