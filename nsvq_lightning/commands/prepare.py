@@ -126,7 +126,7 @@ def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
     path = scene / reconstruct.RECORD
     if not path.is_file():
         own = {"images"} if in_place else set()
-        if scene.is_dir() and {each.name for each in scene.iterdir()} - own:
+        if scene.is_dir() and {each.name for each in scene.iterdir()} - own - {".DS_Store"}:
             raise ValueError(f"{scene} is not empty and was not made by this command: name a new folder")
     elif options.again:
         reconstruct.remove_database(scene)

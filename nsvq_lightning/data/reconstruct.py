@@ -406,7 +406,8 @@ def copy_photos(photos: Sequence[Path], source: Path, folder: Path, report: Repo
             names.append(_copy(path, folder / inside).relative_to(folder).as_posix())
         except DAMAGED as error:
             known = path.suffix.lower() in PHOTOS
-            left[f"cannot be read ({error})" if known else TO_CONVERT].append(str(inside))
+            why, _, _ = str(error).partition(" '")  # Pillow's names the file
+            left[f"cannot be read ({why})" if known else TO_CONVERT].append(str(inside))
         report("copying photos", count, len(photos))
     return names, left
 

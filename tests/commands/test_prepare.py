@@ -54,6 +54,8 @@ def test_folders_of_others_are_left_alone(photos: Path, tmp_path: Path, capsys: 
     assert "not empty and was not made by this command" in _fails(capsys, photos, scene)
     assert "not empty and was not made by this command" in _fails(capsys, photos, scene, "--again")
     assert [path.name for path in scene.iterdir()] == ["mine.txt"]
+    (scene / "mine.txt").rename(scene / ".DS_Store")  # the Finder's
+    assert "1 pictures are too few" in _fails(capsys, photos, scene)
 
 
 def test_other_options_need_a_new_beginning(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

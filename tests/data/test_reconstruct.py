@@ -240,6 +240,9 @@ def test_photos_in_their_place_are_only_added_to(tmp_path: Path) -> None:
     _written(tmp_path / "misnamed.jpg")
     _, closed = copy_photos(photos_in(tmp_path)[0], tmp_path, tmp_path, _silent)
     assert closed == {"cannot be read (it is of another format than its name says: rename it)": ["misnamed.jpg"]}
+    _touch(tmp_path, "x.jpg", "y.jpg")
+    _, closed = copy_photos(photos_in(tmp_path)[0], tmp_path, tmp_path, _silent)
+    assert closed["cannot be read (cannot identify image file)"] == ["x.jpg", "y.jpg"]
 
 
 def _touch(folder: Path, *names: str) -> None:
