@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from nsvq_lightning.data.scene import Scene
     from nsvq_lightning.io.compressed import CompressedScene
     from nsvq_lightning.rendering.camera import Camera
-    from nsvq_lightning.rendering.frame import Place
+    from nsvq_lightning.splats.conventions import Place
 
     # Cameras by the names of their photos, and these.
     Views = tuple[dict[str, Camera], Scene | None]
@@ -254,7 +254,7 @@ def scene_with_views(
     from nsvq_lightning.rendering.camera_paths import arguments_of
     from nsvq_lightning.rendering.sampling import trained_by
 
-    cameras: list[Camera] = []
+    cameras = []
     photos = None
     try:
         known, photos = known_views(path, root, scene)

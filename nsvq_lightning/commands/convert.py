@@ -116,8 +116,7 @@ def _contradiction(options: argparse.Namespace) -> str:
         return "--splats asks the pictures of one scene: thin each scene before they are joined"
     for name, suffixes in WRITER_OPTIONS.items():
         if getattr(options, name) is not None and formats.suffix_of(options.output) not in suffixes:
-            flag = name.replace("_", "-")
-            return f"--{flag} is an option of {suffixes[0]} files, but the output is {options.output}"
+            return f"--{name.replace('_', '-')} is an option of {suffixes[0]} files, but the output is {options.output}"
     return ""
 
 
@@ -174,8 +173,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     look = renderer(on_white(scene) if photos.white else scene)
 
     def psnr(keep: torch.Tensor) -> float:
-        kept = splats.take(keep)
-        return evaluate(look, kept, map(photos.view, photos.test))[0]
+        return evaluate(look, splats.take(keep), map(photos.view, photos.test))[0]
 
     removed = floaters(splats, lambda: map(photos.view, tqdm(photos.train, unit=" photos", mininterval=1)), look)
     before, after = psnr(torch.ones_like(removed)), psnr(~removed)

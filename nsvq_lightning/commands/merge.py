@@ -29,8 +29,8 @@ def run(options: argparse.Namespace) -> int:
     from nsvq_lightning.data.scene import load_scene
     from nsvq_lightning.io.compressed import CompressedScene, on_white, renderer
     from nsvq_lightning.io.formats import format_of, read_scene, save
-    from nsvq_lightning.rendering.frame import ZERO
     from nsvq_lightning.report.numbers import evaluate
+    from nsvq_lightning.splats.conventions import ZERO
 
     format_of(options.output)
     folders = [path.parent for path in options.parts.glob(f"*/{BLOCK}")]

@@ -54,7 +54,7 @@ def expand(arguments: Sequence[str]) -> list[str]:
         option, _, value = argument.partition("=")
         name = option.removeprefix("--")
         if argument.startswith(CONFIG):
-            expanded.append(CONFIG + find_config(value))
+            expanded.append(f"{CONFIG}{find_config(value)}")
         elif not option.startswith("--") or name not in SHORTHANDS:
             expanded.append(argument)
         elif name != "minutes" and size not in (None, name):
@@ -203,8 +203,7 @@ def check_config(path: str) -> dict[str, Any]:
         raise ValueError(f"config {path} has {size} bytes, more than {MAX_BYTES}: give another file")
     try:
         # Not the parser's loader: what is nested too deep would overflow its stack.
-        loader = yaml.SafeLoader(file.read_text(encoding="utf-8"))
-        settings = loader.get_single_data()
+        settings = yaml.SafeLoader(file.read_text(encoding="utf-8")).get_single_data()
         json.dumps(settings, default=str)  # refuses what holds itself
     except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error

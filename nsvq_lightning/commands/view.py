@@ -73,8 +73,7 @@ def run(options: argparse.Namespace) -> int:
         # Seconds between two looks.
         page = viewer_page(file, cameras, title, live=3.0 if options.live else 0.0).encode()
         live = options.scene / LIVE_SCENE if options.live else None
-        settings = {"page": page, "file": file, "live": live, "host": options.host}
-        handler = type("Handler", (_Handler,), settings)
+        handler = type("Handler", (_Handler,), {"page": page, "file": file, "live": live, "host": options.host})
         try:
             server = _Server((options.host, options.port), handler)
         except (OSError, OverflowError) as error:
@@ -118,8 +117,7 @@ def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
     if scene is None:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
     sys.stderr.write("no photos: cameras are guessed from the scene; --data.root names the folder of the photos\n")
-    guesses = likely_cameras(scene.decode(), 12)
-    return {f"guess {index}": camera for index, camera in enumerate(guesses, 1)}
+    return {f"guess {index}": camera for index, camera in enumerate(likely_cameras(scene.decode(), 12), 1)}
 
 
 class _Server(ThreadingHTTPServer):

@@ -35,7 +35,7 @@ def source_digest(module: str) -> str:
     Raises:
         OSError: A source cannot be read.
     """
-    digests: dict[str, bytes] = {}
+    digests = {}
     waiting = [module]
     while waiting:
         name = waiting.pop()

@@ -66,11 +66,6 @@ def flat_checked(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: np.dt
     return array.reshape(-1)
 
 
-def outside(name: str, numbers: Array, count: int) -> ValueError:
-    """The error for row numbers some of which a kernel found outside a table of ``count`` rows."""
-    return ValueError(f"{name} must be in [0, {count}), got {numbers.min()} to {numbers.max()}")
-
-
 def check_inside(name: str, numbers: Array, count: int) -> None:
     """Refuse numbers that are not rows of a table of ``count`` rows.
 
@@ -78,7 +73,7 @@ def check_inside(name: str, numbers: Array, count: int) -> None:
         ValueError: One is not.
     """
     if numbers.size and (numbers.min() < 0 or numbers.max() >= count):
-        raise outside(name, numbers, count)
+        raise ValueError(f"{name} must be in [0, {count}), got {numbers.min()} to {numbers.max()}")
 
 
 class Workspace:

@@ -109,5 +109,4 @@ def sorted_by_key(keys: Tensor, count: int) -> tuple[Tensor, Tensor]:
     # 16-bit keys take a quarter of the sorting passes of 64-bit ones.
     key = torch.int16 if count < 2**15 else torch.int32
     found, places = keys.to(key).sort(stable=True)
-    starts = torch.searchsorted(found, torch.arange(count + 1, dtype=key, device=keys.device), out_int32=True)
-    return places, starts
+    return places, torch.searchsorted(found, torch.arange(count + 1, dtype=key, device=keys.device), out_int32=True)

@@ -318,7 +318,7 @@ def _viewmats(rows: Sequence[tables.ImageRow], path: Path) -> Float64s:
     if worst > _ROUNDED:
         log.warning("%s: quaternions are up to %.2g %% too long or short; they are normalised", path, 100 * worst)
     viewmats = np.tile(np.eye(4), (len(rows), 1, 1))
-    viewmats[:, :3, :3] = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
+    viewmats[:, :3, :3] = Rotation.from_quat(quats, scalar_first=True).as_matrix()
     viewmats[:, :3, 3] = poses[:, 4:]
     return viewmats
 

@@ -24,9 +24,10 @@ from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder
 from nsvq_lightning.data.points import in_picture, random_points
 from nsvq_lightning.data.transforms import read_poses
 from nsvq_lightning.data.undistortion import rectify
+from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.frame import EXTENT, ZERO, Frame, Place, middle_of
-from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s
+from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
+from nsvq_lightning.splats.conventions import ZERO, Bools, Float32s, Float64s, Place
 
 log = logging.getLogger(__name__)
 
@@ -182,7 +183,7 @@ ONE_PLACE = "are taken from one place: without parallax there is no depth; move 
 
 
 def load_scene(
-    root: str | Path,
+    root: StrPath,
     factor: Factor | None = None,
     max_width: int | None = 1600,
     test_every: int = 8,
@@ -364,7 +365,7 @@ def _scaled(lens: Pinhole, divisor: int, max_width: int | None) -> Pinhole:
 
 
 def load_cameras(
-    root: str | Path, factor: Factor | None = None, max_width: int | None = 1600, model: str | None = None, **rest: Any
+    root: StrPath, factor: Factor | None = None, max_width: int | None = 1600, model: str | None = None, **rest: Any
 ) -> dict[str, Camera]:
     """Cameras of a scene folder by the names of its photos, which need not be there; those of :func:`load_scene`.
 
@@ -412,8 +413,7 @@ def usable(scene: Scene) -> Scene:
     Raises:
         SceneError: No train or no test view is left.
     """
-    found = enumerate(each_photo(scene, lambda _: None))
-    wrong = {index: error for index, error in found if error is not None}
+    wrong = {index: error for index, error in enumerate(each_photo(scene, lambda _: None)) if error is not None}
     if not wrong:
         return scene
     first = next(iter(wrong.values()))

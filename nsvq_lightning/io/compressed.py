@@ -12,7 +12,7 @@ import numpy as np
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.rendering.sampling import MAX_CAMERAS, Sampling, fewer_cameras
 from nsvq_lightning.splats import attributes as splat
-from nsvq_lightning.splats.conventions import Arrays, Bools, Float32s, Float64s, Integers, shN_degree
+from nsvq_lightning.splats.conventions import ZERO, Arrays, Bools, Float32s, Float64s, Integers, Place, shN_degree
 
 if TYPE_CHECKING:
     from torch.nn import Module
@@ -72,7 +72,7 @@ class CompressedScene:
     sh_degree: int = 3
     config: Mapping[str, Any] = field(default_factory=dict)
     metrics: Mapping[str, float | None] = field(default_factory=dict)
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    origin: Place = ZERO
     stored_bytes: int | None = None
     bases: Mapping[str, Float32s] = field(default_factory=dict)
     cameras: Float64s = field(default_factory=lambda: np.zeros((0, 4)))
@@ -306,7 +306,7 @@ class CompressedScene:
             found[name] = np.where(np.isfinite(self.codebooks[name]).all(1), 0, np.nan)[codes]
         return splat.finite_rows(found)
 
-    def relative_to(self, origin: tuple[float, float, float]) -> "CompressedScene":
+    def relative_to(self, origin: Place) -> "CompressedScene":
         """The same scene with another origin of its positions."""
         if self.origin == origin:
             return self

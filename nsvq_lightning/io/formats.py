@@ -98,8 +98,8 @@ def save(scene: "AnySplats", path: StrPath, storage: Storage | str | None = None
         raise ValueError(f"cannot write {path}: {suffix_of(path)} is only read")
     with naming_file(path):
         scene = CompressedScene.from_splats(scene).finite()
-    placed = entry.native or suffix_of(path) == ".glb"
-    if any((*scene.background, *(() if placed else scene.origin))) and not entry.native:
+    lost = scene.background if suffix_of(path) == ".glb" else (*scene.background, *scene.origin)
+    if any(lost) and not entry.native:
         logger.warning(f"{path}: not stored: origin {scene.origin}, background {scene.background}; set in the viewer")
     storage = Storage(storage) if isinstance(storage, str) else storage
     if entry.native:

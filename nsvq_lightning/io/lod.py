@@ -133,7 +133,7 @@ def _boxes(scene: CompressedScene) -> Float64s:
     """Smallest and largest coordinates ``[N, 2, 3]`` of the ellipsoid of each splat."""
     from scipy.spatial.transform import Rotation
 
-    axes = Rotation.from_quat(unit(scene.rows("quats"))[:, [1, 2, 3, 0]]).as_matrix()
+    axes = Rotation.from_quat(unit(scene.rows("quats")), scalar_first=True).as_matrix()
     half_axes = axes * np.exp(scene.rows("scales").astype(np.float64))[:, None, :]
     reach = _REACH * np.sqrt(np.square(half_axes).sum(2))
     return np.stack([scene.means - reach, scene.means + reach], axis=1)
@@ -158,7 +158,7 @@ _MAX_BYTES = 1 << 26
 
 
 def _index(path: Path) -> dict[str, list[str]]:
-    """Of ``lod-meta.json``: ``filenames``; those ``shown``, of the finest level and what surrounds the scene; ours."""
+    """Of ``lod-meta.json``: names ``shown``, of the finest level and what surrounds the scene; ``own``, all of ours."""
     with naming_file(path):
         if path.stat().st_size > _MAX_BYTES:
             raise FormatError(f"damaged: an index cannot have {path.stat().st_size} bytes")
@@ -184,7 +184,7 @@ def _index(path: Path) -> dict[str, list[str]]:
             raise FormatError(f"incomplete: {absent[0]} is missing", "copy the whole folder again")
         if (version := index.get("version", 1)) != 1:  # the first writers stated none
             raise FormatError(f"version {str(version)[:40]} of the format; this release reads version 1")
-    return {"filenames": names, "shown": shown, "own": names if index.get("asset") == _ASSET else []}
+    return {"shown": shown, "own": names if index.get("asset") == _ASSET else []}
 
 
 def _is_beside(name: PurePosixPath) -> bool:

@@ -19,7 +19,7 @@ from nsvq_lightning.io.numbers import FLAT, Clamped, finite_logits, finite_logs,
 from nsvq_lightning.io.placing import FAR
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
-from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s
+from nsvq_lightning.splats.conventions import SH_C0, ZERO, Arrays, Float32s, Float64s, Place
 
 log = logging.getLogger(__name__)
 
@@ -174,7 +174,7 @@ def _elements(lines: list[list[str]], encoding: str, file: BinaryIO) -> dict[str
                 fields[-1][2].append((re.sub(_PREFIXES, "", name), order + _TYPES[kind]))
             case _:
                 raise FormatError(f"bad header line {' '.join(line)[:80]!r}")
-    found: dict[str, PlyHeader] = {}
+    found = {}
     before = 0
     for name, count, properties in fields:
         if any(len(each) > 2 for each in properties):
@@ -304,7 +304,7 @@ def read_ply(path: StrPath) -> CompressedScene:
     return CompressedScene.from_rows({**rows, "means": means}, header.antialiased, origin=origin)
 
 
-def _near(means: Arrays) -> tuple[Arrays, tuple[float, float, float]]:
+def _near(means: Arrays) -> tuple[Arrays, Place]:
     """Positions ``[N, 3]`` relative to an origin, which is their middle if that is too far away for float32."""
     if means.dtype == np.float64 and len(finite := means[np.isfinite(means).all(1)]):
         from nsvq_lightning.rendering.frame import middle_of  # imports torch
@@ -312,7 +312,7 @@ def _near(means: Arrays) -> tuple[Arrays, tuple[float, float, float]]:
         middle, usual = middle_of(finite)
         if np.linalg.norm(middle) > FAR * usual:
             return means - middle, tuple(middle.tolist())
-    return means, (0.0, 0.0, 0.0)
+    return means, ZERO
 
 
 def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, Arrays]:

@@ -70,7 +70,7 @@ _EXTENSION = struct.Struct("<III")
 _AXES = 0xADBE0003
 # Where x, y and z point by the number that the extension holds, from 1: right or left, down or up, front or back. The
 # next eight, in which z is up or down, become these by a quarter turn.
-_SYSTEMS = ("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF")
+_SYSTEMS = ("ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf")
 # Bits of a position, and the largest number of them that are fractional.
 _POSITION = 24
 MAX_FRACTION = 30
@@ -273,7 +273,7 @@ def _signs(axes: str, sh_degree: int) -> tuple[Float32s, Float32s, Float32s]:
     Returns:
         Signs of positions ``[3]``, of quaternions wxyz ``[4]``, and of all spherical harmonics ``[D]``.
     """
-    sign = {axis: 1 if a == b else -1 for axis, a, b in zip("xyz", axes, "RDF", strict=True)}
+    sign = {axis: 1 if a == b else -1 for axis, a, b in zip("xyz", axes, DEFAULT_AXES, strict=True)}
     xyz = np.array([*sign.values()], np.float32)
     odd = _ODD[: conventions.sh_coefficients(sh_degree)]
     harmonics = np.array([math.prod(sign[axis] for axis in names) for names in odd], np.float32)
@@ -319,10 +319,10 @@ def write_spz(
     codes = [scene.codes[name] for name in QUANTIZABLE if name in scene.codes]
     scene = scene.in_order(np.lexsort([np.arange(len(scene)), *codes]))
     clamped = Clamped()
-    xyz, quats, harmonics = _signs(axes.upper(), scene.sh_degree)
+    xyz, quats, harmonics = _signs(axes, scene.sh_degree)
     fraction = _fraction_bits(scene)
     # Viewers expect version 3 to be silent, in the default axes; Babylon.js turns a scene that says so upside down.
-    stated = _SYSTEMS.index(axes.upper()) + 1 if version == 4 or axes != DEFAULT_AXES else 0
+    stated = _SYSTEMS.index(axes) + 1 if version == 4 or axes != DEFAULT_AXES else 0
     end = 1 << _POSITION - 1
     means = clamped.nearest("means", scene.means * xyz * (1 << fraction), (-end, end - 1))
     arrays: dict[str, Arrays] = {
@@ -390,7 +390,7 @@ def read_spz(path: StrPath) -> CompressedScene:
         logger.warning("%s: of SH degree %d, degrees up to %d are read", path, header.sh_degree, degree)
     factor = 2 if arrays["tree"].size else 1  # a splat that stands for several may be above 1
     levels = np.minimum(arrays["opacities"].astype(np.uint16) * factor, 255).astype(np.uint8)
-    system = header.system or _SYSTEMS.index(DEFAULT_AXES.upper()) + 1
+    system = header.system or _SYSTEMS.index(DEFAULT_AXES) + 1
     xyz, quats, harmonics = _signs(_SYSTEMS[(system - 1) % 8], degree)
     shN = arrays["shN"][:, : len(harmonics)].astype(np.float32)
     shN -= 128

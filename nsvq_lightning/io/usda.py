@@ -105,8 +105,7 @@ def read_usda(path: StrPath) -> CompressedScene:
         try:
             colors = colors.reshape(len(rows["means"]), -1)
             rows |= {"sh0": colors[:, :3], "shN": colors[:, 3:]}
-            scene = CompressedScene.from_rows(rows, antialiased="bool antialiased = 1" in prim)
-            return rotated(scene, _to_ours(about))
+            return rotated(CompressedScene.from_rows(rows, "bool antialiased = 1" in prim), _to_ours(about))
         except ValueError as error:
             raise FormatError(f"truncated or damaged: {error}") from None
 

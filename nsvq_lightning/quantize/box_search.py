@@ -27,7 +27,6 @@ from nsvq_lightning.compute.memory import (
     check_array,
     check_inside,
     check_table,
-    outside,
 )
 from nsvq_lightning.compute.rows import count_outside
 
@@ -351,5 +350,5 @@ def box_search(
     blocks, tree = -(-len(rows) // _ROWS), _boxes(codebook, order)
     known = last, anchors.ravel(), clearance
     if _search_kernel(dim)(blocks, x.ravel(), rows, codebook.ravel(), tree, known, float(travelled), result):
-        raise outside("rows", rows, count)
+        check_inside("rows", rows, count)
     return result

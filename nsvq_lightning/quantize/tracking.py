@@ -192,8 +192,7 @@ class NearestTracker:
         memory = tuple(array.ravel() for array in self._memory)
         thread_count()
         blocks = -(-len(rows) // _BLOCK)
-        check = _check_kernel(x.shape[1])
-        check(blocks, x.ravel(), rows, codebook.ravel(), memory, self._travelled, drift, result)
+        _check_kernel(x.shape[1])(blocks, x.ravel(), rows, codebook.ravel(), memory, self._travelled, drift, result)
         unsure = np.flatnonzero(result < 0)
         if 2 * len(unsure) > len(rows):  # codes have jumped; a new snapshot spares the next searches the cost
             drift = self._take_snapshot(codebook, drift)

@@ -62,10 +62,9 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     way = np.r_[0.0, np.cumsum(_steps(place(fine), turn(fine), unit))]
     times = np.interp(np.linspace(0.0, way[-1], frames), way, fine)
     lenses = np.stack([np.interp(times, at, column) for column in intrinsics.T], axis=1)
-    matrices = turn(times).as_matrix()
     return [
         camera_of(view_from(matrix, position), tuple(lens), *cameras[0].size, cameras[0].near)
-        for matrix, position, lens in zip(matrices, place(times), lenses, strict=True)
+        for matrix, position, lens in zip(turn(times).as_matrix(), place(times), lenses, strict=True)
     ]
 
 

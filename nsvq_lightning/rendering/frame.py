@@ -7,7 +7,6 @@ extent is 5, as it is in most scenes of COLMAP: learning rates, first sizes and 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -16,12 +15,9 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.poses import viewmat_of
 from nsvq_lightning.rendering.sampling import Sampling
-from nsvq_lightning.splats.conventions import Float32s, Float64s
+from nsvq_lightning.splats.conventions import ZERO, Float32s, Float64s, Place
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
-# x, y, z in the world.
-Place: TypeAlias = tuple[float, float, float]
-ZERO: Place = (0.0, 0.0, 0.0)
 # Extent of the cameras in a frame.
 EXTENT = 5.0
 # Places are rounded to so many steps a unit, a thousandth of a pixel: cameras have the same bits in any unit.

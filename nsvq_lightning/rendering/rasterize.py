@@ -90,8 +90,7 @@ def render(
     absgrad = None
     if pixel_weights is not None:
         if pixel_weights.shape != camera.size[::-1]:
-            expected = [camera.height, camera.width]
-            raise ValueError(f"pixel_weights must be {expected}, got {list(pixel_weights.shape)}")
+            raise ValueError(f"pixel_weights must be {[camera.height, camera.width]}, got {list(pixel_weights.shape)}")
         absgrad = means.new_zeros(1, 1).expand(len(means), 3).requires_grad_()
         pixel_weights = pixel_weights.detach().to(means).contiguous()
     view_sampling = None

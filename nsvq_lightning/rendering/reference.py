@@ -11,7 +11,7 @@ from torch.utils.checkpoint import checkpoint
 
 from nsvq_lightning.rendering import constants
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.sampling import Shading, ViewSampling
+from nsvq_lightning.rendering.sampling import Layers, Shading, ViewSampling
 from nsvq_lightning.rendering.sh import sh_colors
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors
@@ -129,7 +129,7 @@ def visible(splats: SplatTensors, camera: Camera, sampling: ViewSampling | None 
     return ((depths > camera.near) & reached & torch.isfinite(conics).all(-1)).nonzero()[:, 0]
 
 
-def render(splats: RawSplats, camera: Camera, shading: Shading) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def render(splats: RawSplats, camera: Camera, shading: Shading) -> Layers:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``, differentiable.
 
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.

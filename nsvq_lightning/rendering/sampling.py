@@ -11,7 +11,7 @@ pixels, times the ratio of distances only where a splat is nearer, or farther, t
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -62,6 +62,10 @@ class Shading(NamedTuple):
     background: "Tensor"
     pixel_weights: "Tensor | None"
     absgrad: "Tensor | None"
+
+
+# What a back-end gives: image, alpha, radii, means2d and depth of :class:`nsvq_lightning.Render`.
+Layers: TypeAlias = "tuple[Tensor, Tensor, Tensor, Tensor, Tensor]"
 
 
 class Sampling(NamedTuple):

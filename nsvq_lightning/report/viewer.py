@@ -139,17 +139,16 @@ def lens_entry(camera: Camera) -> dict[str, float]:
 
 def write_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
     """Write cameras as INRIA's trainer lists them, which viewers read, with their principal points beside."""
-    entries = []
-    for number, (name, camera) in enumerate(cameras.items()):
-        entries.append(
-            {
-                "id": number,
-                "img_name": name,
-                "position": camera.position.tolist(),
-                "rotation": camera.viewmat[:3, :3].T.tolist(),
-                **lens_entry(camera),
-            }
-        )
+    entries = [
+        {
+            "id": number,
+            "img_name": name,
+            "position": camera.position.tolist(),
+            "rotation": camera.viewmat[:3, :3].T.tolist(),
+            **lens_entry(camera),
+        }
+        for number, (name, camera) in enumerate(cameras.items())
+    ]
     write_text(path, json.dumps(entries))
 
 

@@ -1,7 +1,7 @@
 """How splats are laid out: arrays, quaternions, coefficients of an SH degree. Without torch: files open fast."""
 
 import math
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ Uint32s = NDArray[np.uint32]
 Uint64s = NDArray[np.uint64]
 Integers = NDArray[np.integer]
 Arrays = NDArray[Any]
+# x, y, z in the world.
+Place: TypeAlias = tuple[float, float, float]
+ZERO: Place = (0.0, 0.0, 0.0)
 
 # Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh0.
 SH_C0 = 0.5 / math.sqrt(math.pi)

@@ -51,8 +51,7 @@ class LearningRates:
         for name, value in vars(self).items():
             positive = name.startswith("means")  # interpolated in the logarithm
             if not (math.isfinite(value) and (value > 0 if positive else value >= 0)):
-                bound = "above" if positive else "at least"
-                raise ValueError(f"rate {name} must be finite and {bound} 0, got {value}")
+                raise ValueError(f"rate {name} must be finite and {'above' if positive else 'at least'} 0, got {value}")
 
 
 def position_lr(iteration: int, extent: float, rates: LearningRates, decay_end: int) -> float:
@@ -60,7 +59,7 @@ def position_lr(iteration: int, extent: float, rates: LearningRates, decay_end: 
 
     Log-linear from ``means · extent`` to ``means_final · extent`` at ``decay_end``, then constant.
     """
-    t = min(max(iteration / decay_end, 0.0), 1.0)
+    t = min(iteration / decay_end, 1.0)
     return extent * math.exp((1.0 - t) * math.log(rates.means) + t * math.log(rates.means_final))
 
 

@@ -19,7 +19,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
 from nsvq_lightning.data.scene import Scene
-from nsvq_lightning.io.atomic import make_folder_of, write_bytes
+from nsvq_lightning.io.atomic import StrPath, make_folder_of, write_bytes
 from nsvq_lightning.io.errors import FormatError, Json
 from nsvq_lightning.splats.splats import sh_degree_of
 from nsvq_lightning.training.schedule import Schedule
@@ -95,7 +95,7 @@ def _described(settings: Mapping[str, Mapping[str, Any]]) -> str:
 SCENE = "scene"
 
 
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
+def read_checkpoint(path: StrPath) -> dict[str, Any]:
     """Read a checkpoint of this package onto the CPU.
 
     Raises:
@@ -136,7 +136,7 @@ def _named(error: UnpicklingError) -> str:
     return f"an object of {named[1]}" if named else "an object that is not plain data"
 
 
-def _check_contents(path: str | Path, checkpoint: Any) -> None:
+def _check_contents(path: StrPath, checkpoint: Any) -> None:
     state = checkpoint.get("state_dict") if isinstance(checkpoint, dict) else None
     if not isinstance(state, dict) or "pytorch-lightning_version" not in checkpoint:
         raise FormatError(f"{path}: not a checkpoint of Lightning", WAY_OUT)

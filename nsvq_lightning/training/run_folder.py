@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
-from nsvq_lightning.io.atomic import remove_temporaries, write_text
+from nsvq_lightning.io.atomic import StrPath, remove_temporaries, write_text
 from nsvq_lightning.training.distributed import on_first_process
 
 _FOLDERS: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
@@ -48,7 +48,7 @@ def is_fast_dev_run(trainer: Trainer) -> bool:
     return bool(getattr(trainer, "fast_dev_run", False))
 
 
-def reserve(trainer: Trainer, checkpoint: str | Path | None) -> None:
+def reserve(trainer: Trainer, checkpoint: StrPath | None) -> None:
     """Claim a given folder before the trainer starts: its loggers write, and remove existing files, at once.
 
     Args:
@@ -76,7 +76,7 @@ def claim_version(parent: Path) -> Path:
     raise AssertionError  # count() has no end
 
 
-def take(folder: Path, checkpoint: str | Path | None) -> None:
+def take(folder: Path, checkpoint: StrPath | None) -> None:
     """Create the folder if needed and hold it; set aside the log of the run in it, before a CSV logger removes it.
 
     Args:
@@ -150,7 +150,7 @@ RUN_FILES = (
 )
 
 
-def _refuse_other_run(folder: Path, checkpoint: str | Path | None) -> None:
+def _refuse_other_run(folder: Path, checkpoint: StrPath | None) -> None:
     if not any((folder / name).exists() for name in RUN_FILES):
         return
     if checkpoint is None or not Path(checkpoint).resolve().is_relative_to(folder.resolve()):

@@ -30,8 +30,7 @@ TOLERANCE = 1e-3
 def relative_l2(value: Tensor, truth: Tensor) -> float:
     """‖value − truth‖ / ‖truth‖ in float64; the plain ‖value‖ where the truth is 0."""
     truth = truth.detach().double()
-    distance = torch.linalg.vector_norm(value.detach().double() - truth)
-    scale = torch.linalg.vector_norm(truth)
+    distance, scale = (value.detach().double() - truth).norm(), truth.norm()
     return float(distance / scale if scale > 0 else distance)
 
 

@@ -65,8 +65,7 @@ def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header
         ValueError: A value is too large for its step.
     """
     with _workers() as pool:
-        names = (*_EARLY, *_LONGEST_FIRST)
-        tasks = {name: pool.submit(rounded, scene, name, precision) for name in names}
+        tasks = {name: pool.submit(rounded, scene, name, precision) for name in (*_EARLY, *_LONGEST_FIRST)}
         early = {name: tasks[name].result() for name in _EARLY}
         grid, doublings, depths = position_grid(scene.means, early, precision)
         cells, inside = grid.cells(scene.means)

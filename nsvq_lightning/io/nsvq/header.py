@@ -24,7 +24,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, Json, json_object, naming_file, wrong_start
 from nsvq_lightning.rendering.sampling import MAX_CAMERAS
 from nsvq_lightning.splats.attributes import attribute_dims
-from nsvq_lightning.splats.conventions import Float64s
+from nsvq_lightning.splats.conventions import Float64s, Place
 
 # Magic, BLAKE2b digest of everything after it, version, and bytes of the JSON, whose keys are sorted, without spaces.
 _PREFIX = struct.Struct("<8s16sII")
@@ -100,7 +100,7 @@ class Header:
     level: str
     splats: int
     sh_degree: int
-    origin: tuple[float, float, float]
+    origin: Place
     attributes: tuple[AttributeEntry, ...]
     streams: tuple[StreamEntry, ...]
     config: Json = field(default_factory=dict)
@@ -216,7 +216,7 @@ def _row(kind: type[_T], row: object) -> _T:
     return kind(**{name: _entry(named, name, column) for name, column in columns.items()})
 
 
-def _origin(values: list[Any]) -> tuple[float, float, float]:
+def _origin(values: list[Any]) -> Place:
     if not _are_numbers(values, 3):
         raise FormatError("damaged: header entry 'origin' must be three finite numbers")
     x, y, z = map(float, values)
@@ -275,7 +275,7 @@ def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
         raise FormatError(f"damaged: a header of {json_bytes} bytes in a file of {len(data)}")
     header = replace(Header.from_json(data[_PREFIX.size : start]), version=version)
     payload = memoryview(data)[start:]
-    streams: dict[str, memoryview] = {}
+    streams = {}
     end = 0
     for stream in header.streams:
         streams[stream.name] = payload[end : end + stream.length]

@@ -16,7 +16,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import binning, projection, projection_backward
 from nsvq_lightning.rendering.cpu import blend as blending
 from nsvq_lightning.rendering.cpu import records as rec
-from nsvq_lightning.rendering.sampling import Shading, ViewSampling
+from nsvq_lightning.rendering.sampling import Layers, Shading, ViewSampling
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
 from nsvq_lightning.splats.splats import RawSplats, sh_degree_of
@@ -193,7 +193,7 @@ class _Blend(torch.autograd.Function):
         return None, g_means2d, torch.zeros(()), g_background, None, g_absgrad if with_absgrad else None
 
 
-def render(splats: RawSplats, camera: Camera, shading: Shading) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def render(splats: RawSplats, camera: Camera, shading: Shading) -> Layers:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.

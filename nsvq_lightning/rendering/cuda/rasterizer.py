@@ -10,7 +10,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda.binning import Tiles, list_tiles
 from nsvq_lightning.rendering.cuda.blend import blend, blend_backward, tile_grid
 from nsvq_lightning.rendering.cuda.projection import Lens, project, project_backward, project_radii
-from nsvq_lightning.rendering.sampling import Shading, ViewSampling
+from nsvq_lightning.rendering.sampling import Layers, Shading, ViewSampling
 from nsvq_lightning.splats.splats import RawSplats
 
 
@@ -66,7 +66,7 @@ class _Blend(torch.autograd.Function):
         return None, g_means2d, None, moments, None, g_background, None, g_absgrad
 
 
-def render(splats: RawSplats, camera: Camera, shading: Shading) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def render(splats: RawSplats, camera: Camera, shading: Shading) -> Layers:
     """Image ``[H, W, 3]``, alpha ``[H, W]``, radii ``[N]``, means2d ``[N, 2]`` and depth ``[H, W]``.
 
     See :func:`nsvq_lightning.render` for the meaning of arguments and results.
