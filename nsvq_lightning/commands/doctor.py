@@ -237,7 +237,7 @@ def check_points(model: "ColmapModel") -> Iterator[Finding]:
         yield Finding("problem", "points", f"none is finite: run {program} again")
         return
     far = astray(finite, 10).mean()
-    text = f"{count:,}, {100 * far:.2g} % far outliers"
+    text = f"{count:,}{'' if np.ptp(model.colors) else ', without colours'}, {100 * far:.2g} % far outliers"
     if len(finite) < count:
         text += f", {count - len(finite)} not finite (left out)"
     if count < 1000:

@@ -217,6 +217,15 @@ def test_a_larger_model_beside_the_first_is_a_problem(scene: Path) -> None:
     assert (finding.verdict, finding.text.partition(":")[0]) == ("problem", "sparse/0 has 8 images, sparse/1 has 9")
 
 
+def test_points_without_colours_are_told(scene: Path) -> None:
+    assert "without colours" not in _by_subject(scene)["points"].text
+    reconstruction = import_pycolmap().Reconstruction(str(scene / "sparse/0"))
+    for point in reconstruction.points3D.values():
+        point.color = np.zeros(3, np.uint8)
+    reconstruction.write_binary(str(scene / "sparse/0"))
+    assert "without colours, 0 % far outliers" in _by_subject(scene)["points"].text
+
+
 def test_poses_that_contradict_what_was_seen_are_a_problem(scene: Path) -> None:
     """Camera to world instead of world to camera, the commonest mistake in models that people write themselves."""
     pycolmap = import_pycolmap()
