@@ -7,7 +7,6 @@ import numpy as np
 from lightning.pytorch import Callback, Trainer
 from torch.utils._pytree import tree_map_only
 
-from nsvq_lightning.data.scene import View
 from nsvq_lightning.report.pictures import file_stem
 from nsvq_lightning.training import row_ops
 from nsvq_lightning.training.module import SplatModule
@@ -86,7 +85,7 @@ class SplatCallback(Callback):
     def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Act after a complete iteration, once, also where the run is resumed in between."""
 
-    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, *args: Any) -> None:
         """Call :meth:`before_step`."""
         iteration = trainer.global_step + 1
         if first_time(self, "before", iteration):

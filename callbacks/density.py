@@ -83,9 +83,9 @@ class Densification(SplatCallback, ABC):
             distributed.check_replicas(trainer, "the limit of splats")
             log.info("kept %d of %d splats, those that contribute most to the train views", limit, count)
 
-    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, *args: Any) -> None:
         """Ask for what the statistics need while they are needed."""
-        super().on_train_batch_start(trainer, module, batch, batch_idx)
+        super().on_train_batch_start(trainer, module, batch, *args)
         self._counts = self.ask(module, trainer.global_step + 1, batch)
 
     def on_train_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, *args: Any) -> None:

@@ -2,11 +2,11 @@
 
 import logging
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from lightning.pytorch import Trainer
 
-from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import top_rows
 from nsvq_lightning.training import distributed, row_ops, run_scene
 from nsvq_lightning.training.importance import below_cap, likely_effects
@@ -42,7 +42,7 @@ class OpacityRegularization(SplatCallback):
         """Whether the loss of this iteration has the term."""
         return module.schedule.phase_at(iteration) is Phase.PRUNE
 
-    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, *args: Any) -> None:
         """Turn the term on and off."""
         module.loss_terms.pop("opacity", None)
         if self.is_due(module, trainer.global_step + 1):

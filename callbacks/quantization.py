@@ -11,7 +11,6 @@ from lightning.pytorch import Trainer
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.quantize import attributes
@@ -194,7 +193,7 @@ class CodebookReplacement(SplatCallback):
                 quantizer.usage.zero_()
                 quantizer.window.zero_()
 
-    def on_save_checkpoint(self, trainer: Trainer, module: SplatModule, checkpoint: dict[str, Any]) -> None:
+    def on_save_checkpoint(self, trainer: Trainer, module: SplatModule, *args: Any) -> None:
         """Sum the counts of all processes in the buffers of the first one, which the checkpoint holds."""
         for quantizer in module.quantizers.values():
             _sum_usage(trainer, quantizer)
@@ -393,7 +392,7 @@ class FreezeCodes(SplatCallback):
         """Whether codes are frozen before this iteration."""
         return iteration == module.schedule.first_of(Phase.FINETUNE)
 
-    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, *args: Any) -> None:
         """Freeze when due, and again where splats have changed.
 
         Raises:

@@ -105,7 +105,7 @@ class MetricReport(WritingCallback):
         offset = every // 2 if self.every is None else 0
         return iteration > 0 and (iteration in module.schedule.ends or bool(every and iteration % every == offset))
 
-    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, *args: Any) -> None:
         """Evaluate the last iteration, now that all callbacks have finished with it."""
         if self.is_due(module, trainer.global_step):
             self._evaluate_once(trainer, module)
@@ -179,9 +179,7 @@ class MetricReport(WritingCallback):
         if self._lpips is not None:
             self._lpips.to(module.device)
 
-    def on_test_batch_end(
-        self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int, dataloader_idx: int = 0
-    ) -> None:
+    def on_test_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, *args: Any) -> None:
         """Keep the scores of one view and write its picture."""
         splats = module.evaluation_splats
         if self._scene is None or splats is None:

@@ -2,10 +2,10 @@
 
 import logging
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 from lightning.pytorch import Trainer
 
-from nsvq_lightning.data.scene import View
 from nsvq_lightning.training import run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, Schedule
@@ -177,11 +177,11 @@ class PhaseSchedule(SplatCallback):
 
     on_fit_end = on_train_start  # also where no iteration was left to train, before files are written
 
-    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, *args: Any) -> None:
         """Write the phase of the iteration that starts; end the run earlier by what its warm-up has saved."""
         self._set_max_steps(trainer, self._steps - module.schedule.saved)
         module.phase = module.schedule.phase_at(trainer.global_step + 1)
-        super().on_train_batch_start(trainer, module, batch, batch_idx)
+        super().on_train_batch_start(trainer, module, *args)
 
 
 @dataclass(eq=False)
@@ -218,7 +218,7 @@ class LearningRateDecay(SplatCallback):
     start: Whole | None = 10_600
     """Iteration of the reference run at which they begin to fall; None for the start of fine-tuning."""
 
-    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, *args: Any) -> None:
         """Scale the rates of this iteration."""
         schedule = module.schedule
         start = schedule.ends[Phase.QUANTIZE] if self.start is None else schedule.iteration(self.start)
