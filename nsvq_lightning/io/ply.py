@@ -70,7 +70,7 @@ class PlyHeader:
         dtype: Structured dtype of one row (for ascii, that of the parsed row).
         offset: Byte of the first row; for ascii, of the first line after the header.
         lines: Lines of other elements between ``offset`` and the first vertex (ascii only).
-        antialiased: Whether a comment says that the splats were trained with anti-aliasing.
+        antialiased: Whether a comment, or the filter of Mip-Splatting, says that they were trained with anti-aliasing.
         others: The other elements by name, described likewise; those after a list, whose length varies, are left out.
     """
 
@@ -140,7 +140,7 @@ def _parsed(file: BinaryIO) -> PlyHeader:
     elements = _elements(lines, formats[0], file)
     if "vertex" not in elements:
         raise FormatError("the header has no element vertex")
-    antialiased = False
+    antialiased = "filter_3D" in elements["vertex"].properties  # trained with a filter of the pixels, too
     for words in lines:  # the last comment that says how the splats were trained counts
         match [word.lower() for word in words]:
             case ["comment", "splatrendermode:", mode]:
@@ -290,8 +290,9 @@ def read_ply(path: StrPath) -> CompressedScene:
     The number of ``f_rest`` properties gives the SH degree, 0 to 3; other properties and elements are skipped. Discs (a
     third scale of -inf, or none) get the thickness :data:`~nsvq_lightning.io.numbers.FLAT`; ``red green blue`` stand in
     for ``f_dc_0`` to 2. Doubles far from 0, as on a map, become relative to an origin. The widths ``filter_3D`` of
-    Mip-Splatting (Yu et al. 2024) are added to those of the splats, √(σ² + f²), and opacities fall by as much as these
-    grow. A compressed ``.ply`` of PlayCanvas is known by its header.
+    Mip-Splatting (Yu et al. 2024) are added to those of the splats, √(σ² + f²), opacities fall by as much as these
+    grow, and the scene is one to be rendered with anti-aliasing, as it was trained. A compressed ``.ply`` of PlayCanvas
+    is known by its header.
 
     Raises:
         FormatError: The file is truncated, or not a ``.ply`` of Gaussian splats.

@@ -275,6 +275,8 @@ def test_the_filter_of_mip_splatting_becomes_part_of_the_splats(tmp_path: Path) 
     opacities = 1 / (1 + np.exp(-splats.opacities.astype(float)))
     expected = opacities * (sizes / wider).prod(1)
     assert np.allclose(1 / (1 + np.exp(-found.opacities.astype(float))), expected, rtol=1e-4)
+    assert found.antialiased  # it was trained with a filter of the pixels, too
+    assert not splats.antialiased
 
 
 def test_harmonics_beyond_what_a_compressed_file_holds_are_told(
