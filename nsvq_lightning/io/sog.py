@@ -159,7 +159,7 @@ class _Archive:
             self.meta["count"] = shape[0] if isinstance(shape, list) and shape else None
         self.count = self._integer(self.meta, "count", 0, 1 << 40)
         check_room("splats or texels", self.count, self._size)
-        if self.version == 1 and "shN" in self.meta:  # only its picture shows how large the palette is
+        if "shN" in self.meta and "count" not in self._entry("shN"):  # its picture shows how large the palette is
             height, width = self._picture("shN", 0).shape[:2]
             bands = {_ROWS_A_LINE * sh_coefficients(degree): degree for degree in (1, 2, 3)}.get(width)
             self.meta["shN"] |= {"bands": bands, "count": min(_ROWS_A_LINE * height, PALETTE_LIMIT)}

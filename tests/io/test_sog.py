@@ -96,6 +96,15 @@ def test_a_wrong_description_of_version_1(tmp_path: Path, change: Any, message: 
         read_scene(bundled(tmp_path / "y.sog", meta, files))
 
 
+def test_the_size_of_a_palette_may_be_that_of_its_picture(tmp_path: Path) -> None:
+    """As LichtFeld Studio leaves it out."""
+    meta, files = contents(coded_scene(COUNT, 2), tmp_path)
+    whole = read_scene(bundled(tmp_path / "x.sog", meta, files))
+    del meta["shN"]["count"]
+    found = read_scene(bundled(tmp_path / "y.sog", meta, files))
+    np.testing.assert_array_equal(found.rows("shN"), whole.rows("shN"))
+
+
 @pytest.mark.parametrize(("kind", "below"), [("PNG", ""), ("WEBP", ""), ("WEBP", "pictures/")])
 def test_a_folder_of_pictures(tmp_path: Path, kind: str, below: str) -> None:
     meta, files = contents(coded_scene(COUNT, 1), tmp_path)
