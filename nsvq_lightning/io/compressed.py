@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# What nerfstudio calls the coefficients of colours.
-NERFSTUDIO = {"features_dc": "sh0", "features_rest": "shN"}
+# Attributes by their names here and in nerfstudio.
+NAMES = {name: name for name in splat.ATTRIBUTES} | {"features_dc": "sh0", "features_rest": "shN"}
 
 
 def slices(count: int) -> "Iterator[slice]":
@@ -110,7 +110,7 @@ class CompressedScene:
 
         Args:
             splats: The splats, or their attributes by their names here or in nerfstudio, tensors or arrays of any
-                numbers, or a checkpoint of gsplat with these; or a module that was trained, whose
+                numbers, or a checkpoint of gsplat or nerfstudio with these; or a module that was trained, whose
                 :meth:`~nsvq_lightning.SplatModule.compressed` it is; a compressed scene is returned as it is.
             header: ``antialiased``, ``metrics`` and ``origin``; or ``config``.
 
@@ -129,10 +129,11 @@ class CompressedScene:
             log.warning("the splats of a module are in coordinates of training: give the module itself")
         named = splats if isinstance(splats, Mapping | torch.nn.ParameterDict) else detached(splats)._asdict()
         rows = {
-            NERFSTUDIO.get(name, name): values.detach().to("cpu", torch.float32, copy=True).numpy()
+            key: values.detach().to("cpu", torch.float32, copy=True).numpy()
             if isinstance(values, torch.Tensor)
             else np.array(values, np.float32)
-            for name, values in named.get("splats", named).items()  # which checkpoints of gsplat have
+            for name, values in named.get("splats", named.get("pipeline", named)).items()  # of gsplat, nerfstudio
+            if (key := NAMES.get(name.rpartition(".")[2]))
         }
         if missing := set(splat.ATTRIBUTES) - {"shN"} - rows.keys():
             raise ValueError(f"the splats have no {', '.join(sorted(missing))}")

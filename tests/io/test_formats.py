@@ -41,9 +41,15 @@ def test_attributes_by_name_are_saved_as_they_come(tmp_path: Path) -> None:
     found = load(tmp_path / "a.ply")
     for name, values in splats.attributes().items():
         assert torch.equal(getattr(found, name), values.bfloat16().float() if name == "shN" else values)
+    pipeline = {f"_model.gauss_params.{name}": values for name, values in named.items()}
+    pipeline["_model.step"] = torch.ones(())
+    save({"step": 1, "pipeline": pipeline, "optimizers": {}}, tmp_path / "b.ply")  # and those of nerfstudio
+    assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
     del named["scales"]
     with pytest.raises(ValueError, match="the splats have no scales"):
         save(named, tmp_path / "a.ply")
+    with pytest.raises(ValueError, match="the splats have no means, "):
+        save({"state_dict": named, "name": "run 3"}, tmp_path / "a.ply")
 
 
 def test_options_reach_the_format(tmp_path: Path) -> None:
