@@ -18,6 +18,8 @@ MIN_FOCAL = 0.01
 class Camera:
     """Pinhole camera in COLMAP's conventions: x right, y down, z forward; pixel centres at .5.
 
+    Its numbers are taken when it is made: writing into its matrices has no effect, :func:`dataclasses.replace` has.
+
     Attributes:
         K: Intrinsics ``[3, 3]`` in pixels, principal point included; skew must be 0. Arrays and lists become tensors.
         viewmat: World to camera, rigid, ``[4, 4]``, scene units.

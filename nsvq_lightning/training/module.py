@@ -128,6 +128,7 @@ class SplatModule(LightningModule):
         if not 0.0 <= dssim_weight <= 1.0:
             raise ValueError(f"dssim_weight must be between 0 and 1, got {dssim_weight}")
         self.splats = Splats(sh_degree) if splats is None else Splats.from_tensors(*map(Tensor.float, detached(splats)))
+        sh_degree = self.splats.sh_degree  # what a checkpoint says of splats that were given
         self.codebooks = nn.ModuleDict(build_quantizers(quantizer, codebooks, self.splats))
         self.quantizer_settings = {
             name: {"quantizer": type(made).__name__, "codes": len(made.codebook)}
@@ -141,7 +142,7 @@ class SplatModule(LightningModule):
         self.storage = Storage.from_dict(storage) if isinstance(storage, Mapping) else storage
         self.backend = backend
         self.antialiased = antialiased
-        self.seed = seed
+        self.seed = seed = int(seed)
         self.init_from = init_from
         self.save_hyperparameters(ignore=["splats"])
         self.frame = Frame()
@@ -283,6 +284,7 @@ class SplatModule(LightningModule):
     def on_train_start(self) -> None:
         """Set Adam's numbers of this run, not those of a checkpoint; start measuring the training time."""
         check_device(self.device)
+        self.splats.edits += 1  # they are the caller's no more
         views = self.trainer.world_size * self.trainer.accumulate_grad_batches
         optim.check_groups(self.trainer.optimizers, self.quantizers)
         self._step_factor = optim.adapt_to_views(self.trainer.optimizers[0], self.rates, views)
@@ -401,6 +403,7 @@ class SplatModule(LightningModule):
         """Go on from these."""
         phase, degree, self.extent, self.stopwatch.seconds, unit, *places = state.tolist()
         self.phase = Phase(int(phase))
+        self.splats.edits += 1
         self.active_sh_degree = int(degree)
         frame = Frame(unit, tuple(places[:3]), tuple(places[3:]))
         scene = run_scene.scene_of(self._trainer)  # whose photos may be others, around another middle

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from lightning.pytorch import Trainer
@@ -242,6 +243,25 @@ def test_a_module_is_saved_where_its_files_are(
     module.splats.edits = 1  # as once splats have grown
     save(module.splats, tmp_path / "scene.ply")
     assert "in coordinates of training: give the module itself" in caplog.text
+    caplog.clear()
+    other = SplatModule(sh_degree=1, codebooks=CODES, splats=make_splats())
+    save(other.splats, tmp_path / "scene.ply")
+    assert not caplog.text
+    other.load_state_dict(module.state_dict())
+    save(other.splats, tmp_path / "scene.ply")
+    assert "in coordinates of training: give the module itself" in caplog.text
+
+
+def test_settings_of_a_checkpoint_are_those_of_the_splats_and_plain_numbers(demo_scene: Path, tmp_path: Path) -> None:
+    module = SplatModule(codebooks=None, splats=make_splats(), seed=np.int64(3))  # type: ignore[arg-type]
+    trainer = SplatTrainer(max_steps=1, callbacks=[], enable_checkpointing=False, enable_progress_bar=False)
+    trainer.fit(module, ColmapDataModule(demo_scene))
+    assert type(module.seed) is int
+    trainer.save_checkpoint(tmp_path / "a.ckpt")
+    found = SplatModule.load_from_checkpoint(tmp_path / "a.ckpt")
+    assert found.splats.sh_degree == module.splats.sh_degree == 1
+    assert torch.equal(found.splats.means, module.splats.means)
+    assert save(found, tmp_path / "a.nsvq") == save(module, tmp_path / "b.nsvq")
 
 
 def test_trained_splats_are_rendered_with_all_their_coefficients() -> None:
