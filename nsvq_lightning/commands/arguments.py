@@ -155,7 +155,7 @@ def _found_views(path: Path, root: Path | None, origin: "Place") -> "Views":
     from nsvq_lightning.data.transforms import has_poses
     from nsvq_lightning.rendering.camera_paths import CAMERAS, read_cameras
 
-    data: dict[str, Any] = {}
+    data = {}
     try:
         data = {} if root else {**check_config(str(_run_of(path) / "config.yaml"))["data"]["init_args"]}
     except (KeyError, TypeError):  # a config of something else

@@ -15,7 +15,6 @@ import shlex
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import READ, positive
@@ -51,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
 
     if options.output.exists():
         raise FileExistsError(f"{options.output} exists: remove it, or give another folder")
-    read: dict[str, Any] = {}
+    read = {}
     if options.further:
         given = yaml.safe_load(resolve([*options.further, f"--data.root={options.scene}"]))["data"]["init_args"]
         read = {name: given[name] for name in READ if name in given}

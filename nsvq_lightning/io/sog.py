@@ -81,7 +81,7 @@ def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
         "scales.webp": scales,
         "sh0.webp": np.c_[colors, bytes_of(scene.opacities)],
     }
-    meta: Json = {
+    meta = {
         "version": 2,
         "asset": {"generator": "nsvq-lightning"},
         "count": len(scene),
