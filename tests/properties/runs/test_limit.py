@@ -9,6 +9,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from runs import Recipe, RunFactory, Whole
 
 from nsvq_lightning.callbacks import DensityControl
+from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.training.run_scene import train_contributions
 
 
@@ -29,18 +30,21 @@ def limited(most: int | None) -> DensityControl:
 def test_no_iteration_has_more(run: RunFactory, recipe: Recipe) -> None:
     counts, most = Counts(), 400
     _, module = run([*recipe(density=limited(most)).values(), counts])
-    assert counts.seen[0] == most  # the scene has 500 points
+    assert counts.seen[0] == 280  # the scene has 500 points; there is room to grow
     assert max(counts.seen) == most
     assert len(module.splats) <= most
 
 
-def test_what_stays_is_what_the_photos_see(run: RunFactory, recipe: Recipe) -> None:
+def test_what_stays_is_drawn_by_what_the_photos_see(run: RunFactory, recipe: Recipe) -> None:
     trainer, everything = run(recipe(density=limited(None)).values(), max_steps=1, module={"rates": {"means": 1e-12}})
     contribution = train_contributions(trainer, everything.scene)
-    expected = everything.splats.means[contribution.argsort(descending=True)[:50]]
+    drawn = draw_rows(contribution.sqrt(), 35, generator(everything.seed, 0, "limit"))
+    expected = everything.splats.means[drawn]
+    assert contribution[drawn].mean() > 1.1 * contribution.mean()
     _, few = run(recipe(density=limited(50)).values(), max_steps=1, module={"rates": {"means": 1e-12}})
+    assert len(few.splats) == 35
     same = (few.splats.means[:, None] - expected[None]).abs().amax(2).amin(1) < 1e-4
-    assert same.sum() > 45  # one step of the other attributes has moved the order a little
+    assert same.sum() > 32  # one step of the other attributes has moved the order a little
 
 
 def test_the_limit_comes_too_late_for_codebooks(paper: Whole, caplog: pytest.LogCaptureFixture) -> None:
