@@ -139,4 +139,4 @@ def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
         if found != record:
             raise ValueError(f"{scene} was prepared from {found.get('source')} or otherwise: --again begins anew")
     (scene / "images").mkdir(parents=True, exist_ok=True)
-    write_text(path, json.dumps(record, indent=2) + "\n")
+    write_text(path, f"{json.dumps(record, indent=2)}\n")

@@ -1,7 +1,7 @@
 """Which attributes are quantized, with which codebooks, and a scene whose rows are replaced by their codes."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -85,7 +85,7 @@ def noisy_rows(
     Returns:
         ``V`` splats; gradients reach the chosen rows and the codebooks.
     """
-    subset: dict[str, Any] = {}
+    subset = {}
     for name, tensor in splats._asdict().items():
         if name not in quantizers:
             subset[name] = take_rows(tensor, rows)

@@ -111,7 +111,7 @@ def summarize(
 def write_metrics(path: Path, metrics: Values) -> None:
     """Write the numbers as JSON, atomically; an infinite PSNR (no error at all) becomes null."""
     finite = json.loads(json.dumps(metrics), parse_constant=lambda name: None)
-    write_text(path, json.dumps(finite, indent=2) + "\n")
+    write_text(path, f"{json.dumps(finite, indent=2)}\n")
 
 
 def _codes_in_use(codes: Integers, size: int) -> Json:

@@ -129,7 +129,7 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
         video = cv2.VideoWriter(str(first), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
         if not video.isOpened():
             raise OSError(f"OpenCV cannot write {code} here: write PNGs into a folder")
-        frames: list[object] = []
+        frames = []
         try:
             yield lambda rgb: frames.append(video.write(rgb[:, :, ::-1]))
         finally:

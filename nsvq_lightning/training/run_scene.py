@@ -3,7 +3,6 @@
 import logging
 import time
 from collections.abc import Iterator
-from typing import cast
 
 import torch
 from lightning.pytorch import Trainer
@@ -30,7 +29,7 @@ FIRST_OPACITY, MAX_PIXELS = 0.3, 50.0
 
 def scene_of(trainer: Trainer | None) -> Scene | None:
     """The scene of the trainer's data module; None if it has none."""
-    return cast("Scene | None", getattr(getattr(trainer, "datamodule", None), "scene", None))
+    return getattr(getattr(trainer, "datamodule", None), "scene", None)
 
 
 def needed_scene(trainer: Trainer, need: str, otherwise: str) -> Scene:

@@ -148,7 +148,7 @@ def encode_integers(values: Integers, order: Int64s | None = None) -> bytes:
     check_array("order", order, (len(values),), INT64)
     check_inside("order", order, len(values))
     bits = np.empty((_MODES, values.shape[1]), np.int64)  # about as many as each mode takes
-    left: Int64s | int = 0
+    left = 0
     for column, numbers in enumerate(values.T):
         ordered = numbers[order].astype(np.int64)
         both = [(each, np.diff(each, prepend=0)) for each in (ordered, ordered - left)]
