@@ -185,9 +185,8 @@ class DensityControl(Densification):
     limit_name = "max_splats"
 
     max_splats: int | None = None
-    """Upper limit on the number of splats. If the scene starts with more, fewer than that are drawn by what they
-    contribute to the train views; during growth, those with the largest statistic come first. None for no limit, as in
-    the paper."""
+    """Upper limit on the number of splats. Of more at the start, fewer are drawn by what they contribute to the train
+    views; during growth, those with the largest statistic come first. None for no limit, as in the paper."""
     start: Count = 600
     """First iteration that clones and splits."""
     last: int = 14_900
