@@ -193,7 +193,8 @@ class _Frame:
             if f"fl_{axis}" in self.values:
                 given[axis] = self.number(f"fl_{axis}")
             elif f"camera_angle_{axis}" in self.values:
-                given[axis] = side / 2 / max(math.tan(self.number(f"camera_angle_{axis}") / 2), 1e-12)
+                # Larger angles are in degrees: they leave no focal length.
+                given[axis] = side / 2 / max(math.tan(min(self.number(f"camera_angle_{axis}"), math.pi) / 2), 1e-12)
         for focal in given.values():
             if not focal > 0:
                 raise self.error(f"has the focal length {focal:g}")

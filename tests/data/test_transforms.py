@@ -229,6 +229,7 @@ def test_a_colmap_model_comes_first_and_any_can_be_chosen(make_scene: SceneFacto
         ({}, {"k4": 0.1}, "OPENCV and k4 = 0.1, which cannot"),
         ({}, {"fl_x": None, "fl_y": None}, "frame 0 has no focal length"),
         ({}, {"fl_x": -3}, "focal length -3"),
+        ({}, {"fl_x": None, "fl_y": None, "camera_angle_x": 51.3}, r"focal lengths and a centre, in pixels, got \("),
         ({}, {"fl_x": 0.3}, r"image .* focal lengths and a centre, in pixels, got \(0\.3"),
         ({"cx": "wide"}, {}, "frame 0 has cx = 'wide'"),
         ({"cx": float("nan")}, {}, "frame 0 has cx = nan"),
