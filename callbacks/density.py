@@ -26,8 +26,8 @@ from .settings import Count, NonNegative, Opacity, Positive, Whole
 
 log = logging.getLogger(__name__)
 
-# Share of the limit that is left where a run starts with more splats. The others are added where they are missed: all
-# that the limit allows, those that contribute most, were 1 dB worse with twice as many points as splats.
+# Share of the limit that is left where a run starts with more points, or with more splats than the limit. The others
+# are added where they are missed: all that the limit allows, those that contribute most, were 1 dB worse.
 KEPT = 0.7
 
 
@@ -77,7 +77,8 @@ class Densification(SplatCallback, ABC):
                 ones matter.
         """
         limit, count = self.limit(module), len(module.splats)
-        if limit is None or count <= limit:
+        # Of points, all beyond the share are too many.
+        if limit is None or count <= limit * (1 if trainer.global_step or module.active_sh_degree else KEPT):
             return
         if module.phase > Phase.PRUNE:
             log.warning(f"{self.limit_name}={limit} comes too late for {count} splats with codebooks; all are kept")

@@ -43,7 +43,7 @@ def unknown_option(message: str, options: Iterable[str]) -> str:
     if found is None:
         return ""
     known = [option for option in options if option.startswith("--") and not option.endswith((".help", "+"))]
-    return nearest("--" + (found[1] or found[2]), known)
+    return nearest(f"--{found[1] or found[2]}", known)
 
 
 def names(text: str) -> tuple[str, ...]:
