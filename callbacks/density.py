@@ -77,7 +77,7 @@ class Densification(SplatCallback, ABC):
                 ones matter.
         """
         limit, count = self.limit(module), len(module.splats)
-        # Of points, all beyond the share are too many.
+        # Of points, which have no harmonics yet, all beyond the share are too many: they are placed anew by growth.
         if limit is None or count <= limit * (1 if trainer.global_step or module.active_sh_degree else KEPT):
             return
         if module.phase > Phase.PRUNE:
@@ -186,8 +186,8 @@ class DensityControl(Densification):
     limit_name = "max_splats"
 
     max_splats: int | None = None
-    """Upper limit on the number of splats. Of more at the start, fewer are drawn by what they contribute to the train
-    views; during growth, those with the largest statistic come first. None for no limit, as in the paper."""
+    """Upper limit on the number of splats. Of more at the start, or about as many points, 0.7 of it are drawn by what
+    they contribute to the train views; in growth, the largest statistic comes first. None for none, as in the paper."""
     start: Count = 600
     """First iteration that clones and splits."""
     last: int = 14_900

@@ -271,9 +271,9 @@ def load_scene(
     sources = _image_sources(poses, files, mask_files, divisor, max_width if factor is None else None)
     poses, frame = _framed(poses, root, origin)
     cameras = tuple(_camera(image, source.pinhole, frame) for image, source in zip(poses.images, sources, strict=True))
-    grey = len(np.unique(poses.colors)) < 2
+    points = poses.points
+    grey = not len(points) or not np.ptp(poses.colors)
     if grey:
-        points = poses.points
         if len(points):
             log.info("the points of %s have no colours: they start grey, behind those that photos show", root)
         else:
