@@ -72,9 +72,9 @@ class ExposureCompensation(SplatCallback):
 
     def _exposed(self, rendered: Render, view: View) -> Render:
         """The rendered picture with the exposure of a train photo."""
-        change, image = self._changes[self._row[view.index]] - self._changes.mean(0), rendered.image
-        flat = torch.addmm(change[:, 3], image.reshape(-1, 3), (torch.eye(3, device=change.device) + change[:, :3]).T)
-        return rendered._replace(image=flat.reshape(image.shape))
+        change = self._changes[self._row[view.index]] - self._changes.mean(0)
+        matrix = torch.eye(3, device=change.device) + change[:, :3]
+        return rendered._replace(image=torch.nn.functional.linear(rendered.image, matrix, change[:, 3]))
 
     def on_before_optimizer_step(self, trainer: Trainer, module: SplatModule, optimizer: Any) -> None:
         """Take a step with the gradients averaged over all processes, unless the iteration is to change nothing."""

@@ -62,7 +62,7 @@ def grown(scene: Scene, count: int) -> Splats:
     start = detached(Splats.from_points(scene.points, scene.colors))
     points = len(start.means)
     copies = math.ceil(count / points)
-    rows = torch.arange(points).repeat(copies)[: max(count, points)]
+    rows = torch.arange(max(count, points)) % points
     copied = start.take(rows)
     draw = generator(0, 0, "forecast")
     # More splats cover the surfaces with smaller ones, and trained ones overlap in many layers. With these two numbers,

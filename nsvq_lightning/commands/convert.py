@@ -186,11 +186,10 @@ def _thinned(scene: CompressedScene, count: int, options: argparse.Namespace) ->
     """The splats that contribute most to photos of --data.root, or to the scene's own pictures."""
     from nsvq_lightning.compression.viewpoints import VIEWS
     from nsvq_lightning.random import top_rows
-    from nsvq_lightning.training.importance import contributions, row_weights
+    from nsvq_lightning.training.importance import contributions
 
     cameras = views_of(options.inputs[0], scene, VIEWS, options.root)
-    found = contributions(scene.tensors(), cameras, renderer(scene))
-    return scene.take(top_rows(row_weights(found), count).numpy())
+    return scene.take(top_rows(contributions(scene.tensors(), cameras, renderer(scene)), count).numpy())
 
 
 def _measure(source: Path, output: Path, root: Path | None) -> None:

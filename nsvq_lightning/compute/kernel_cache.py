@@ -112,8 +112,7 @@ class _Locator(_CacheLocator):
     def get_source_stamp(self) -> str:
         return ""
 
-    def get_disambiguator(self) -> str:
-        return ""
+    get_disambiguator = get_source_stamp
 
 
 class _Layout(CompileResultCacheImpl):

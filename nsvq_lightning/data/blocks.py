@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -142,12 +143,13 @@ def cut(scene: Scene, count: int, **options: Any) -> list[Block]:
             raise SceneError(f"the photos show too few points of {scene.root} for {count} parts: ask for fewer")
         if number == 1:
             return [Block(axes.tolist(), core.tolist(), around.tolist(), str(scene.root.resolve()), count, options)]
-        spread = [np.subtract(*_quantiles(column, weights, (0.95, 0.05))) for column in places.T]
+        quantiles = partial(np.quantile, weights=weights, method="inverted_cdf")
+        spread = [np.subtract(*quantiles(column, (0.95, 0.05))) for column in places.T]
         axis = np.argmax(spread)
         along = places[:, axis]
         first = number // 2
         shares = np.array([first - OVERLAP, first - SLACK, first + SLACK, first + OVERLAP]) / number
-        lower, start, stop, upper = _quantiles(along, weights, shares)
+        lower, start, stop, upper = quantiles(along, shares)
         near = np.sort(along[(along >= start) & (along <= stop)])
         gap = np.diff(near, append=near[-1]).argmax()
         seam = near[gap : gap + 2].mean()
@@ -168,12 +170,6 @@ def cut(scene: Scene, count: int, **options: Any) -> list[Block]:
 
     everywhere = np.array([[-_FAR] * 2, [_FAR] * 2])
     return parts(np.ones(len(points), bool), everywhere, everywhere, count)
-
-
-def _quantiles(values: Float64s, weights: Float64s, shares: Sequence[float] | Float64s) -> Float64s:
-    order = values.argsort()
-    sums = weights[order].cumsum()
-    return np.asarray(values[order][sums.searchsorted(np.array(shares) * sums[-1])])
 
 
 # A point in a file: its position, then its colour.

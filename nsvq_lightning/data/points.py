@@ -69,7 +69,7 @@ def cloud_in(folders: list[Path]) -> Path | None:
 
 def share_seen(points: Float64s, cameras: list[Camera]) -> float:
     """Mean share of the cameras that have a point in their picture, walls disregarded."""
-    return sum(np.count_nonzero(in_picture(points, camera)) for camera in cameras) / max(1, len(points) * len(cameras))
+    return float(np.mean([in_picture(points, camera).mean() for camera in cameras]))
 
 
 # Points of a scene that comes without.
@@ -98,8 +98,7 @@ def random_points(cameras: list[Camera]) -> Float64s:
     x = (across * width - cx) / fx
     y = (down * height - cy) / fy
     rays = np.c_[x, y, np.ones(count)]
-    local = rays * (2 * distance * away)[:, None]
-    points = centres[chosen] + np.einsum("pij,pj->pi", rotations.as_matrix()[chosen], local)
+    points = centres[chosen] + rotations[chosen].apply(rays * (2 * distance * away)[:, None])
     # One after another: all pictures at once would take a byte for each point and camera.
     sightings = sum(in_picture(points, camera).astype(int) for camera in cameras)
     return np.asarray(points[np.argsort(-sightings, kind="stable")[:RANDOM_POINTS]])

@@ -29,6 +29,7 @@ from PIL.ExifTags import IFD, Base
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
 from nsvq_lightning.data.images import DAMAGED, ImageHead, read_image
 from nsvq_lightning.data.photo_files import PHOTOS, photos_below
+from nsvq_lightning.data.scene import spread
 from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
 
 log = logging.getLogger(__name__)
@@ -80,8 +81,7 @@ class Verdict:
             yield f"{apart}take more photos between"
         if not self.missing:
             return
-        some_placed = self.registered[:: max(1, count // MIN_PHOTOS)]
-        usual = median_high(sharpness(read_image(images / name)) for name in some_placed)
+        usual = median_high(sharpness(read_image(images / name)) for name in spread(self.registered, MIN_PHOTOS))
         yield "  without a place, better taken again:"
         for name, partners in itertools.islice(self.missing.items(), MAX_NAMED):
             reason = f"shares enough with {partners} other photos" if partners else "overlaps no other"
@@ -472,7 +472,7 @@ def some(names: Sequence[str], most: int = MAX_NAMED) -> str:
 
 
 def sharpness(picture: MatLike) -> float:
-    """Variance of the Laplacian of a picture, reduced to the same width whatever its size: more is sharper."""
+    """Variance of the Laplacian of a BGR picture ``[H, W, 3]``, at most 480 pixels wide: more is sharper."""
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     factor = min(1.0, 480 / grey.shape[1])  # noise is no sharpness
     small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)

@@ -346,8 +346,8 @@ def _points(
     views = []
     for image in images:
         lens = cameras[image.camera_id]
-        K = torch.from_numpy(lens.calibration_matrix())
-        views.append(Camera(K, torch.from_numpy(image.viewmat), lens.width, lens.height))
+        view = torch.from_numpy(image.viewmat)
+        views.append(Camera(lens.calibration_matrix(), view, lens.width, lens.height))
     moved = points @ applied[:3, :3].T + applied[:3, 3]
     if share_seen(moved, views) > 1.5 * share_seen(points, views):
         log.info("%s: the points are not in the frame of the cameras: applied_transform moves them there", path)

@@ -99,8 +99,8 @@ class Undistortion:
         if self._maps is not None:
             return self._maps
         pixels = self._source_pixels()
-        # more than a pixel outside, or NaN where the ray leaves the domain of the camera model
-        blank = np.any((pixels <= -1) | (pixels >= self._size) | np.isnan(pixels), axis=-1)
+        # a pixel or more from the centres of the border, or NaN where the ray leaves the domain of the camera model
+        blank = ~np.all((pixels > -1) & (pixels < self._size), axis=-1)
         columns, rows = (np.nan_to_num(pixels[..., i], nan=-1.0) for i in (0, 1))
         if blank.any() and not self._warned:
             self._warned = True

@@ -282,7 +282,7 @@ class CompressedScene:
         """The same splats, with codebooks of only the rows that they use; without splats, of the first one."""
         codes, codebooks = {}, {}
         for name, rows in self.codes.items():
-            used, codes[name] = np.unique(rows, return_inverse=True)
+            used, codes[name] = np.unique_inverse(rows)
             codebooks[name] = self.codebooks[name][used if len(used) else [0]]
         return replace(self, codes=codes, codebooks=codebooks)
 
@@ -391,7 +391,7 @@ def _check_codes(name: str, codes: Integers, codebook: Float32s, n: int, dim: in
     _check_floats(f"codebooks[{name!r}]", codebook, (rows, dim))
     if codes.shape != (n,):
         raise ValueError(f"codes[{name!r}] must have shape [{n}], got {list(codes.shape)}")
-    if not np.issubdtype(codes.dtype, np.integer):
+    if not np.isdtype(codes.dtype, "integral"):
         raise TypeError(f"codes[{name!r}] must be integers, got {codes.dtype}")
     if rows == 0:
         raise ValueError(f"codebooks[{name!r}] is empty; a codebook needs at least one row")

@@ -52,6 +52,8 @@ def wrong_start(suffix: str, data: bytes, magic: bytes) -> FormatError:
 
 # An object of JSON.
 Json = dict[str, Any]
+# What reading one raises that holds something else than it should.
+STRANGE = ValueError, TypeError, LookupError, AttributeError, RecursionError
 # A file, or a part of one.
 Bytes = bytes | memoryview
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, Json, check_room, json_object, naming_file, wrong_start
+from nsvq_lightning.io.errors import STRANGE, FormatError, Json, check_room, json_object, naming_file, wrong_start
 from nsvq_lightning.io.numbers import finite_logs, logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, moved, rotated
 from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s, sh_coefficients, unit
@@ -26,8 +26,8 @@ EXTENSION = "KHR_gaussian_splatting"
 OPACITY = f"{EXTENSION}:OPACITY"
 KERNEL = "ellipse"
 
-# Magic, version, length of the file; then, of each chunk, length and type.
-_HEAD, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+# Magic, version, length of the file, and what each chunk begins with, here the first: length and type.
+_HEAD, _CHUNK = struct.Struct("<4sIII4s"), struct.Struct("<I4s")
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
@@ -104,9 +104,9 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
     }
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    total = _HEAD.size + 2 * _CHUNK.size + len(text) + end
+    total = _HEAD.size + len(text) + _CHUNK.size + end
     with atomic_write(path) as file:
-        file.write(_HEAD.pack(b"glTF", 2, total) + _CHUNK.pack(len(text), b"JSON") + text + _CHUNK.pack(end, b"BIN\0"))
+        file.write(_HEAD.pack(b"glTF", 2, total, len(text), b"JSON") + text + _CHUNK.pack(end, b"BIN\0"))
         for values in arrays.values():
             file.write(np.ascontiguousarray(values).data)
     return total
@@ -134,7 +134,7 @@ def read_glb(path: StrPath) -> CompressedScene:
             return rotated(CompressedScene.joined(parts), HALF_TURN)
         except FormatError:
             raise
-        except (KeyError, TypeError, IndexError, AttributeError, ValueError, RecursionError) as error:
+        except STRANGE as error:
             raise FormatError(f"of a kind that is not read, or altered: {error!r}", "save it as a plain .glb") from None
 
 
@@ -143,15 +143,13 @@ _MAX_JSON = 1 << 26
 
 def _parsed(data: bytes) -> tuple[Json, memoryview]:
     """JSON and binary chunk."""
-    if len(data) < _HEAD.size + _CHUNK.size or data[:4] != b"glTF":
+    if len(data) < _HEAD.size or data[:4] != b"glTF":
         raise wrong_start(".glb", data, b"glTF")
-    _, version, total = _HEAD.unpack_from(data)
-    length, kind = _CHUNK.unpack_from(data, _HEAD.size)
-    start = _HEAD.size + _CHUNK.size
-    end = start + length
+    _, version, total, length, kind = _HEAD.unpack_from(data)
+    end = _HEAD.size + length
     if version != 2 or max(total, end) > len(data) or kind != b"JSON" or length > _MAX_JSON:
         raise FormatError(f"truncated or damaged: version {version}, {total} of {len(data)} bytes, a chunk of {length}")
-    return json_object(data[start:end], "the first chunk"), memoryview(data)[end + _CHUNK.size :]
+    return json_object(data[_HEAD.size : end], "the first chunk"), memoryview(data)[end + _CHUNK.size :]
 
 
 def _primitives(document: Json) -> Iterator[tuple[Json, Float64s]]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath, make_folder_of, write_bytes, write_text
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, Json, naming_file
+from nsvq_lightning.io.errors import STRANGE, FormatError, Json, naming_file
 from nsvq_lightning.io.sog import META, PALETTE_LIMIT, read_sog, sog_contents
 from nsvq_lightning.splats.conventions import Float64s, Integers, unit
 
@@ -165,16 +165,16 @@ def _index(path: Path) -> dict[str, list[str]]:
         try:
             index = json.loads(path.read_bytes())
             names, nodes = [str(PurePosixPath(name)) for name in index["filenames"]], [index["tree"]]
-            finest: dict[int, None] = {}
+            finest: dict[str, None] = {}  # an ordered set: names of the files with splats of level 0
             while nodes:
                 node = nodes.pop()
                 nodes += reversed(node.get("children", ()))
                 if "0" in node.get("lods", {}):
-                    finest[range(len(names))[node["lods"]["0"]["file"]]] = None
-            shown = [names[number] for number in finest]
+                    finest[names[node["lods"]["0"]["file"]]] = None
+            shown = list(finest)
             if around := index.get("environment"):
                 shown.append(str(PurePosixPath(around)))
-        except (ValueError, RecursionError, KeyError, TypeError, IndexError, AttributeError) as error:
+        except STRANGE as error:
             raise FormatError(f"damaged: not the index of a streamed SOG ({error!r})") from None
         if strange := [name for name in (*names, *shown) if not _is_beside(PurePosixPath(name))]:
             raise FormatError(f"damaged: {strange[0][:80]!r} is no FOLDER/{META} or .sog beside it")

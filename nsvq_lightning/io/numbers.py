@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath
-from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int32s, Uint8s
+from nsvq_lightning.splats.conventions import Float32s, Float64s, Int32s, Uint8s
 
 # Logarithm that stands for that of an axis length of 0, which discs have: too thin to show, and not beyond any format's
 # range by more than it must be.
@@ -65,11 +65,8 @@ logger = logging.getLogger(__name__)
 _ROUNDING = 1e-3
 
 
-class Clamped:
+class Clamped(Counter[str]):
     """Rounds and clamps values to a range; counts the splats outside it, by attribute."""
-
-    def __init__(self) -> None:
-        self._counts = Counter[str]()
 
     def nearest(self, name: str, values: NDArray[np.floating], ends: tuple[int, int]) -> Int32s:
         """The nearest integers that the format has.
@@ -83,16 +80,12 @@ class Clamped:
             Integers ``[N, D]``.
         """
         rounded = np.clip(np.rint(values), *ends)
-        self.count(name, np.abs(rounded - values) > 0.5 + _ROUNDING)
+        self[name] += (np.abs(rounded - values) > 0.5 + _ROUNDING).any(1).sum()
         return np.asarray(np.nan_to_num(rounded), np.int32)
-
-    def count(self, name: str, beyond: Bools) -> None:
-        """Count the splats with any values ``[N, D]`` of an attribute that are beyond its range."""
-        self._counts[name] += beyond.any(1).sum()
 
     def warn(self, path: StrPath, count: int) -> None:
         """Warn how many of ``count`` splats were clamped to the format's range."""
-        changed = ", ".join(f"{name} {splats}" for name, splats in self._counts.items() if splats)
+        changed = ", ".join(f"{name} {splats}" for name, splats in self.items() if splats)
         if changed:
             logger.warning(f"{path}: out of the range of its format, clamped to it: {changed} (of {count} splats)")
 
@@ -106,11 +99,6 @@ def power_above(value: float) -> float:
     """The smallest power of two that is at least a positive ``value``."""
     below = power_below(value)
     return below if below == value else 2 * below
-
-
-def nearest_power(value: float) -> float:
-    """The power of two whose ratio to a positive ``value`` is between √½ and √2."""
-    return power_above(value / math.sqrt(2.0))
 
 
 def coarsest_power(values: Float32s) -> float:

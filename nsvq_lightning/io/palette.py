@@ -138,7 +138,7 @@ def in_order_of_use(rows: Float32s, labels: Integers) -> tuple[Float32s, Int64s]
         rows: ``[K, D]``.
         labels: Row of each splat ``[N]``.
     """
-    used, labels = np.unique(labels, return_inverse=True)
+    used, labels = np.unique_inverse(labels)
     distinct, same = np.unique(rows[used], axis=0, return_inverse=True)
     labels = same.reshape(-1)[labels]  # its shape differs between releases of NumPy
     _, first = np.unique(labels, return_index=True)
@@ -159,7 +159,7 @@ def scalar_kmeans(values: Float32s, weight: Integers | int = 1, count: int = 256
         weight: How often each value counts, broadcasts with ``values``.
         count: Number of levels; the last one is repeated if fewer are enough.
     """
-    distinct, inverse = np.unique(values, return_inverse=True)
+    distinct, inverse = np.unique_inverse(values)
     weights = np.broadcast_to(weight, values.shape).ravel()
     mass = np.bincount(inverse.ravel(), weights)
     numbers = distinct[mass > 0].astype(np.float64)

@@ -252,15 +252,6 @@ def _needed(header: PlyHeader, sh_degree: int) -> dict[str, list[str]]:
     return columns
 
 
-def _coefficients(colors: Float32s, is_float: bool) -> Float32s:
-    """SH coefficients of colours: floats to 1, or whole numbers to 255 or 65535, as the numbers themselves tell."""
-    finite = colors[np.isfinite(colors)]
-    full = 255 if finite.max(initial=0) <= 255 else 65535
-    if is_float and len(finite) and np.quantile(finite, 0.9) <= 1:
-        full = 1
-    return ((colors / full - 0.5) / SH_C0).astype(np.float32)
-
-
 def _check_packed(header: PlyHeader) -> None:
     chunk = header.others["chunk"]
     sh = header.others.get("sh")
@@ -319,7 +310,8 @@ def _near(means: Arrays) -> tuple[Arrays, Place]:
 def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, Arrays]:
     """Rows ``[N, D]`` of each attribute."""
     columns = _needed(header, sh_degree)
-    known = {*chain(*columns.values()), *_UNUSED, *_RGB, "alpha", "filter_3D"}
+    needed = [*chain(*columns.values())]
+    known = {*needed, *_UNUSED, *_RGB, "alpha", "filter_3D"}
     if others := [name for name in header.properties if name not in known]:
         shown = " ".join(others[:5])
         log.warning("%s: %d other properties are left out (%s): splats that move stand still", path, len(others), shown)
@@ -329,7 +321,7 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
     rows["means"] = rows["means"].astype(kind)
     ends = np.cumsum([len(names) for names in columns.values()])
     start = 0
-    for table in read_ply_columns(path, header, [*chain(*columns.values())], kind):
+    for table in read_ply_columns(path, header, needed, kind):
         for name, part in zip(columns, np.split(table, ends[:-1], axis=1), strict=True):
             rows[name][start : start + len(table), : part.shape[1]] = part
         start += len(table)
@@ -451,7 +443,7 @@ def write_ply(path: StrPath, scene: CompressedScene) -> int:
 
 def _by_color(rows: Arrays) -> Arrays:
     """Higher coefficients ``[N, D]``, the three colours of each, in the order of files: all of red first."""
-    return rows.reshape(len(rows), rows.shape[1] // 3, 3).swapaxes(1, 2).reshape(rows.shape)
+    return rows.reshape(len(rows), rows.shape[1] // 3, 3).mT.reshape(rows.shape)
 
 
 def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
@@ -495,10 +487,7 @@ def _packed_part(scene: CompressedScene, clamped: Clamped) -> dict[str, NDArray[
         levels = np.floor(32 * _by_color(scene.rows("shN")) + 128)
         levels = clamped.nearest("shN", levels, (0, 255)).astype(np.uint8)
         tables["sh"] = dict(zip(splat_columns(scene.sh_degree)["shN"], levels.T, strict=True))
-    return {
-        name: np.rec.fromarrays([*table.values()], [(column, values.dtype) for column, values in table.items()])
-        for name, table in tables.items()
-    }
+    return {name: np.rec.fromarrays([*table.values()], names=[*table]) for name, table in tables.items()}  # type: ignore[call-overload]  # its types ask for formats, too
 
 
 def write_elements(path: StrPath, elements: Mapping[str, NDArray[np.void]], antialiased: bool = False) -> int:

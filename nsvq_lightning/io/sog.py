@@ -50,6 +50,8 @@ _ROWS_A_LINE = 64
 _LEVELS = 256
 _LARGEST = float(np.finfo(np.float32).max)
 _ZIP = b"PK\x03\x04"
+# What zipfile raises about an archive that is damaged, or of a kind that it does not read.
+_BAD_ZIP = zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, RuntimeError, ValueError
 
 
 def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
@@ -148,7 +150,7 @@ class _Archive:
             raise wrong_start(".sog", data, _ZIP)
         try:
             self._zip = zipfile.ZipFile(io.BytesIO(data))
-        except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError) as error:
+        except _BAD_ZIP as error:
             raise FormatError(f"truncated: no valid zip archive ({error})") from None
         self.meta = json_object(self._bytes(META, 1 << 20), META)
         self.version = self.meta.get("version", 1)
@@ -178,7 +180,7 @@ class _Archive:
         try:
             with self._zip.open(entry) as file:
                 return file.read(entry.file_size)  # not read(name), which unpacks all there is, whatever its length
-        except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, ValueError, struct.error) as error:
+        except _BAD_ZIP as error:
             raise FormatError(f"damaged: {name} cannot be unpacked ({error})") from None
 
     def _entry(self, name: str) -> Json:

@@ -20,7 +20,7 @@ from nsvq_lightning.io.atomic import StrPath, write_bytes
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.numbers import Clamped, bytes_of, logits_of_bytes, logs_of_lengths
-from nsvq_lightning.splats.conventions import SH_C0, Float32s, Uint8s, unit
+from nsvq_lightning.splats.conventions import SH_C0, unit
 
 logger = logging.getLogger(__name__)
 
@@ -55,20 +55,16 @@ def _records(scene: CompressedScene, clamped: Clamped) -> NDArray[np.void]:
     scales = scene.rows("scales")
     # Between the smallest and the largest length that float32 holds with full precision.
     held = scales.clip(-87.0, 88.0)
-    clamped.count("scales", held != scales)
+    clamped["scales"] += (held != scales).any(1).sum()
     records["lengths"] = np.exp(held)
     colors = 255 * (0.5 + SH_C0 * scene.rows("sh0"))
     records["colors"][:, :3] = clamped.nearest("sh0", colors, (0, 255))
     records["colors"][:, 3] = bytes_of(scene.opacities)
-    records["quats"] = _packed_quats(scene.rows("quats"))
-    return records
-
-
-def _packed_quats(quats: Float32s) -> Uint8s:
-    units = unit(quats)
+    units = unit(scene.rows("quats"))
     # Of q and -q, the one whose largest component is negative: -1 fits a byte, 1 does not.
     largest = np.take_along_axis(units, np.abs(units).argmax(1)[:, None], 1)
-    return np.asarray(np.rint(128 + 128 * np.where(largest > 0, -units, units)), np.uint8)
+    records["quats"] = np.rint(128 + 128 * np.where(largest > 0, -units, units))
+    return records
 
 
 def read_splat(path: StrPath) -> CompressedScene:

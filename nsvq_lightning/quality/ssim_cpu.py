@@ -94,19 +94,13 @@ def similarity_of_row(moments, derivatives, length, pitch, lanes):
 
 
 @inline
-def pair_sum(ring, y, distance, o, pitch):
-    """Sum of the rows ``distance`` above and below row y."""
-    above, below = row_of(y - distance, DERIVATIVES, pitch), row_of(y + distance, DERIVATIVES, pitch)
-    return simd.load(ring, above + o) + simd.load(ring, below + o)
-
-
-@inline
 def blur_across(ring, y, plane, x, pitch):
     """Eleven taps down the ring buffer, centred on row y, of one derivative plane."""
     o = plane * pitch + x
     total = TAPS[0] * simd.load(ring, row_of(y, DERIVATIVES, pitch) + o)
     for distance in range(1, SSIM_RADIUS + 1):
-        total = simd.fma(TAPS[distance], pair_sum(ring, y, distance, o, pitch), total)
+        above, below = row_of(y - distance, DERIVATIVES, pitch), row_of(y + distance, DERIVATIVES, pitch)
+        total = simd.fma(TAPS[distance], simd.load(ring, above + o) + simd.load(ring, below + o), total)
     return total
 
 

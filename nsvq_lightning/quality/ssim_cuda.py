@@ -8,8 +8,6 @@ Every program writes its own sums and one program adds them up: no atomics, the 
 back from the device.
 """
 
-from typing import Any, NamedTuple
-
 import torch
 import triton
 import triton.language as tl
@@ -31,6 +29,8 @@ DERIVATIVES = 3
 ROWS = 4
 # Floats of each row per program, three to a pixel.
 COLUMNS = 128
+# Further arguments of every kernel that works on planes.
+TILE = {"ROWS": ROWS, "COLUMNS": COLUMNS, **COMPILE}
 # Number of programs whose sums are added up at a time.
 BLOCK = 1024
 
@@ -199,31 +199,19 @@ def gradient_kernel(
 MOMENTS = 4
 
 
-class _Launch(NamedTuple):
-    """How kernels are launched on a pair of pictures.
+def _launch(image: Tensor, target: Tensor) -> tuple[tuple[int, int], tuple[int, int], bool]:
+    """How kernels are launched on a pair of pictures, after a check of these.
 
-    Attributes:
-        grid: Programs down and along them.
-        size: Their rows, and floats in a row.
-        of_bytes: Whether the target is uint8.
-        tile: Further arguments of every kernel.
+    Returns:
+        Programs down and along them; their rows, and floats in a row; whether the target is uint8.
     """
-
-    grid: tuple[int, int]
-    size: tuple[int, int]
-    of_bytes: bool
-    tile: dict[str, Any]
-
-    @classmethod
-    def on(cls, image: Tensor, target: Tensor) -> "_Launch":
-        """Check the pictures first."""
-        check_pair(image, target)
-        of_bytes = target.dtype == torch.uint8
-        check_tensor("image", image, image.shape, image.device)
-        check_tensor("target", target, image.shape, image.device, torch.uint8 if of_bytes else torch.float32)
-        height, width, _ = image.shape
-        grid = triton.cdiv(height, ROWS), triton.cdiv(3 * width, COLUMNS)
-        return cls(grid, (height, 3 * width), of_bytes, {"ROWS": ROWS, "COLUMNS": COLUMNS, **COMPILE})
+    check_pair(image, target)
+    of_bytes = target.dtype == torch.uint8
+    check_tensor("image", image, image.shape, image.device)
+    check_tensor("target", target, image.shape, image.device, torch.uint8 if of_bytes else torch.float32)
+    height, width, _ = image.shape
+    grid = triton.cdiv(height, ROWS), triton.cdiv(3 * width, COLUMNS)
+    return grid, (height, 3 * width), of_bytes
 
 
 def fused_loss(
@@ -245,15 +233,15 @@ def fused_loss(
         ValueError: The pictures differ in shape or device or are not ``[H, W, 3]``, or one is not contiguous.
         TypeError: A dtype is wrong.
     """
-    grid, size, of_bytes, tile = _Launch.on(image, target)
+    grid, size, of_bytes = _launch(image, target)
     programs = grid[0] * grid[1]
     moments = image.new_empty(MOMENTS, *image.shape)
     planes = image.new_empty(DERIVATIVES, *image.shape) if derived else moments
     sums = image.new_empty(programs, 2)
     loss = image.new_empty(4)
     with torch.cuda.device_of(image):
-        moments_kernel[grid](image, target, moments, sums, *size, PSNR=psnr, BYTES=of_bytes, **tile)
-        similarity_kernel[grid](moments, planes, sums, *size, DERIVED=derived, **tile)
+        moments_kernel[grid](image, target, moments, sums, *size, PSNR=psnr, BYTES=of_bytes, **TILE)
+        similarity_kernel[grid](moments, planes, sums, *size, DERIVED=derived, **TILE)
         loss_kernel[(1,)](sums, loss, programs, image.numel(), dssim_weight, PSNR=psnr, BLOCK=BLOCK, **COMPILE)
     return loss[0], planes, loss[1:]
 
@@ -272,13 +260,13 @@ def fused_loss_backward(image: Tensor, target: Tensor, derivatives: Tensor, step
         ValueError: As in :func:`fused_loss`, or the derivatives belong to another picture.
         TypeError: A dtype is wrong.
     """
-    grid, size, of_bytes, tile = _Launch.on(image, target)
+    grid, size, of_bytes = _launch(image, target)
     check_tensor("derivatives", derivatives, (DERIVATIVES, *image.shape), image.device)
     check_tensor("steps", steps, (3,), image.device)
     check_tensor("scale", scale, (), image.device)
     blurred = torch.empty_like(derivatives)
     gradient = torch.empty_like(image)
     with torch.cuda.device_of(image):
-        spread_kernel[(*grid, DERIVATIVES)](derivatives, blurred, *size, **tile)
-        gradient_kernel[grid](image, target, blurred, steps, scale, gradient, *size, BYTES=of_bytes, **tile)
+        spread_kernel[(*grid, DERIVATIVES)](derivatives, blurred, *size, **TILE)
+        gradient_kernel[grid](image, target, blurred, steps, scale, gradient, *size, BYTES=of_bytes, **TILE)
     return gradient

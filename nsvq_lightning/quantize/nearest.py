@@ -147,7 +147,7 @@ def _blocks(codebook: Array, rates: Array) -> Array:
     """Blocks of 16 codes, ``[⌈K/16⌉, D + 1, 16]`` flat: their values, and rates; infinite in lanes without a code."""
     table = np.c_[codebook, rates]
     padded = np.pad(table, ((0, -len(table) % 16), (0, 0)), constant_values=np.inf)
-    return padded.reshape(-1, 16, table.shape[1]).transpose(0, 2, 1).ravel()
+    return padded.reshape(-1, 16, table.shape[1]).mT.ravel()
 
 
 @cache

@@ -109,8 +109,7 @@ def _directions(residual: Tensor, seed: int, aim: float, spread: float) -> Tenso
 
 def _unit(vectors: Tensor) -> Tensor:
     """Rows scaled to length 1; zero rows stay 0."""
-    length: Tensor = vectors.norm(dim=1, keepdim=True)
-    return vectors / torch.where(length > 0, length, torch.inf)
+    return torch.nn.functional.normalize(vectors, eps=torch.finfo(vectors.dtype).tiny)
 
 
 class DiVeQ(CodebookQuantizer):
@@ -135,7 +134,7 @@ class DiVeQ(CodebookQuantizer):
 
     def __init__(self, num_codes: int, dim: int, *, sigma: float = 1e-3, **settings: Any) -> None:
         super().__init__(num_codes, dim, **settings)
-        if not (math.isfinite(sigma) and sigma >= 0):
+        if not 0 <= sigma < math.inf:
             raise ValueError(f"sigma must be finite and at least 0, got {sigma}")
         self.sigma = sigma
 

@@ -33,16 +33,15 @@ def _centred(codebook: Array) -> tuple[Array, Array, Array, np.float32]:
     count, dim = codebook.shape
     finite = np.isfinite(codebook).all(1)
     centre = (codebook[finite] if finite.any() else np.zeros((1, dim))).mean(0, dtype=np.float64).astype(np.float32)
-    codes = np.zeros((-(-count // 32) * 32, dim), np.float32)
     with np.errstate(over="ignore"):
-        codes[:count] = codebook - centre
+        codes = np.pad(codebook - centre, ((0, -count % 32), (0, 0)))
         halves = (np.einsum("ij,ij->i", codes, codes, dtype=np.float64) / 2).astype(np.float32)
     lost = ~np.isfinite(halves)
     lost[count:] = True
     codes[lost] = 0
     halves[lost] = np.inf
     blocks = aligned_empty((len(codes) // 32, dim, 32))
-    blocks[:] = codes.reshape(-1, 32, dim).transpose(0, 2, 1)
+    blocks[:] = codes.reshape(-1, 32, dim).mT
     return centre, blocks.ravel(), halves, F(np.sqrt(2 * float(halves[~lost].max(initial=0))))
 
 

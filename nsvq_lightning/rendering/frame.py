@@ -50,13 +50,12 @@ class Frame:
         """
         middle = np.median(centres, axis=0)
         extent = 1.1 * reach_of(np.linalg.norm(centres - middle, axis=1))
-        x, y, z = middle.tolist()
-        return cls(extent / EXTENT or 1.0, (x, y, z))
+        return cls(extent / EXTENT or 1.0, tuple(middle.tolist()))
 
     def relative_to(self, origin: Place) -> "Frame":
         """The same coordinates of files whose positions are relative to another origin."""
-        x, y, z = np.add(self.middle, np.subtract(self.origin, origin)).tolist()
-        return Frame(self.unit, (x, y, z), origin)
+        middle = np.add(self.middle, np.subtract(self.origin, origin))
+        return Frame(self.unit, tuple(middle.tolist()), origin)
 
     @property
     def near(self) -> float:

@@ -17,7 +17,7 @@ LITTLE = 1e-5
 def poses(cameras: Sequence[Camera]) -> tuple[Float64s, Rotation]:
     """Positions ``[N, 3]``, and rotations from camera to world."""
     packed = np.array([camera.packed_view for camera in cameras])
-    return packed[:, 12:], Rotation.from_matrix(packed[:, :9].reshape(-1, 3, 3).transpose(0, 2, 1))
+    return packed[:, 12:], Rotation.from_matrix(packed[:, :9].reshape(-1, 3, 3).mT)
 
 
 def looked_at(cameras: Sequence[Camera]) -> Float64s:

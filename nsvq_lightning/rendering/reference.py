@@ -83,7 +83,7 @@ def sampling_ratio(squared: Tensor, sampling: ViewSampling | None) -> Tensor:
     if sampling is None:
         return torch.ones_like(squared)
     nearest, farthest = sampling.distances.to(squared).square()
-    trained = torch.where(squared < nearest, nearest, torch.where(squared > farthest, farthest, squared))
+    trained = torch.where(squared < nearest, nearest, squared.clamp_max(farthest))
     return sampling.size * (trained / squared).clamp_max(constants.MAX_RATIO)
 
 
@@ -101,7 +101,7 @@ def project(splats: SplatTensors, camera: Camera, sampling: ViewSampling | None 
     (x, y, z), u, v = image_axes(splats.means, splats.quats, splats.scales, camera)
     xx, xy, yy = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
     size = (xx + yy).detach()
-    unit = torch.where(size > constants.HUGE_FOOTPRINT, 1 / size, torch.ones_like(size))
+    unit = torch.where(size > constants.HUGE_FOOTPRINT, 1 / size, 1.0)
     area = (torch.linalg.cross(u, v) * unit[:, None]).square().sum(-1)
     trained = constants.BLUR * sampling_ratio(x * x + y * y + z * z, sampling)
     blur = trained.clamp_min(constants.BLUR)
@@ -165,8 +165,7 @@ def render(splats: RawSplats, camera: Camera, shading: Shading) -> Layers:
             here = (low[:, 0] <= right) & (high[:, 0] >= left) & (low[:, 1] <= bottom) & (high[:, 1] >= top)
             near = order[here]
             down, across = torch.arange(top, bottom).to(centres), torch.arange(left, right).to(centres)
-            ys, xs = torch.meshgrid(down, across, indexing="ij")
-            pixels = torch.stack([xs, ys], -1).reshape(-1, 2) + 0.5
+            pixels = torch.cartesian_prod(down, across).flip(1) + 0.5
             weights_here = pixel_weights[top:bottom, left:right].reshape(-1)
             inputs = (
                 pixels, centres[near], projection.conics[near], projection.opacities[near], features[near],
@@ -221,10 +220,10 @@ def _blend(
     dx, dy = offsets.unbind(-1)
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
     alpha = (opacities * power.clamp_max(0).exp()).clamp_max(constants.ALPHA_MAX)
-    alpha = torch.where(alpha >= constants.ALPHA_MIN, alpha, torch.zeros_like(alpha))
+    alpha = torch.where(alpha >= constants.ALPHA_MIN, alpha, 0.0)
     with torch.no_grad():
         running = (1 - alpha).cumprod(1) >= constants.TRANSMITTANCE_MIN
-    alpha = torch.where(running, alpha, torch.zeros_like(alpha))
+    alpha = torch.where(running, alpha, 0.0)
     transmittance = torch.cat([pixels.new_ones(len(pixels), 1), (1 - alpha).cumprod(1)], 1)
     weights = alpha * transmittance[:, :-1]
     weights = _WatchWeights.apply(weights, pixel_weights, absgrad[:, 2])  # type: ignore[no-untyped-call]

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nsvq_lightning.splats.conventions import sh_coefficients
+from nsvq_lightning.splats.conventions import SH_C0, sh_coefficients
 
-C0 = 0.28209479177387814
+C0 = SH_C0
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)

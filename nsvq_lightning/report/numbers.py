@@ -116,7 +116,7 @@ def write_metrics(path: Path, metrics: Values) -> None:
 
 def _codes_in_use(codes: Integers, size: int) -> Json:
     """Rows of the codebook, how many of them are used, and the entropy of the codes, bits each."""
-    counts = np.unique(codes, return_counts=True)[1]
+    counts = np.unique_counts(codes).counts
     return {"codebook": size, "used": len(counts), "entropy": float(stats.entropy(counts, base=2))}
 
 

@@ -32,7 +32,7 @@ MAX_CAMERAS = 300
 def write_viewer(path: StrPath, scene_file: StrPath, cameras: Mapping[str, Camera], title: str) -> int:
     """Write a page that holds a ``.nsvq`` file, its reader, a renderer and cameras; it loads nothing from elsewhere.
 
-    It orbits about the direction that is up for the cameras (:func:`nsvq_lightning.rendering.camera.up_of`).
+    It orbits about the direction that is up for the cameras (:func:`nsvq_lightning.rendering.poses.up_of`).
 
     Args:
         path: HTML file to write, replaced atomically.
@@ -66,12 +66,13 @@ def viewer_page(scene_file: StrPath, cameras: Mapping[str, Camera], title: str, 
     if not cameras:
         raise ValueError("a page needs at least one camera to start from, got none")
     cameras = dict(spread(list(cameras.items()), MAX_CAMERAS))
+    views = list(cameras.values())
     about, start, behind = "", 0, (0.0, 0.0, 0.0)
     if live is None or Path(scene_file).is_file():
         stored = read_nsvq(scene_file)
         behind = stored.background
         about = f"{len(stored):,} splats, {(stored.stored_bytes or 0) / 1e6:.2f} MB. "
-        start = best_view(stored.tensors(), list(cameras.values()))
+        start = best_view(stored.tensors(), views)
     if live is None:
         file = base64.b64encode(Path(scene_file).read_bytes()).decode()
         source = f'<script id="file" type="text/plain">{file}</script>'
@@ -82,8 +83,8 @@ def viewer_page(scene_file: StrPath, cameras: Mapping[str, Camera], title: str, 
     scene = {
         "cameras": [{"name": name, **camera_entry(camera)} for name, camera in cameras.items()],
         "background": behind,
-        "up": up_of(list(cameras.values())).tolist(),
-        "near": float(min(camera.near for camera in cameras.values())),
+        "up": up_of(views).tolist(),
+        "near": float(min(camera.near for camera in views)),
         "start": start,
     }
     return fill(

@@ -57,6 +57,8 @@ DEFAULT_SIZE = "16k"
 
 # Attributes that may have a codebook, in file order; positions and opacities never have (paper, section 3).
 QUANTIZABLE = tuple(name for name, attribute in ATTRIBUTES.items() if attribute.code_share)
+# The same, those with most codes first, of these those of fewest numbers, as the paper has them (section 4).
+QUANTIZED = "scales", "quats", "sh0", "shN"
 
 
 def codebook_bits(codebooks: Mapping[str, Sequence[float]]) -> tuple[float, float]:
@@ -122,14 +124,6 @@ def dropped(mask: _Array, culprits: Mapping[str, int]) -> str:
     return f"dropped {int((~mask).sum())} of {len(mask)} splats with non-finite values: {listed(culprits)}"
 
 
-# The quantized attributes, those with most codes first, and their numbers of codes relative to that for scales (paper,
-# section 4). Positions and opacities are not vector quantized.
-QUANTIZED = {
-    name: ATTRIBUTES[name].code_share
-    for name in sorted(QUANTIZABLE, key=lambda name: (-ATTRIBUTES[name].code_share, attribute_dims(3)[name]))
-}
-
-
 def codebook_sizes(name: str) -> dict[str, int]:
     """Number of codes for each attribute in one of the paper's settings.
 
@@ -145,4 +139,4 @@ def codebook_sizes(name: str) -> dict[str, int]:
     """
     if name not in SIZES:
         raise ValueError(f"unknown codebook setting {name!r}; choose one of {', '.join(SIZES)}")
-    return {attribute: int(SIZES[name] * share) for attribute, share in QUANTIZED.items()}
+    return {attribute: int(SIZES[name] * ATTRIBUTES[attribute].code_share) for attribute in QUANTIZED}

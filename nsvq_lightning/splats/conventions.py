@@ -21,11 +21,26 @@ Arrays = NDArray[Any]
 Place: TypeAlias = tuple[float, float, float]
 ZERO: Place = (0.0, 0.0, 0.0)
 
+# Higher spherical-harmonic coefficients per colour channel by degree, (degree + 1)² - 1.
+_COEFFICIENTS = 0, 3, 8, 15
 # Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * sh0.
 SH_C0 = 0.5 / math.sqrt(math.pi)
 
 # ``[4, 3]``: the components other than each one, ascending.
 _OTHERS = np.array([[j for j in range(4) if j != i] for i in range(4)])
+
+
+def white_of(colors: Arrays, fractions: bool) -> int:
+    """What stands for white in colours of any kind: 1, 255, 4095 or 65535, the first that nearly all do not exceed.
+
+    A few above it, of interpolation or bright reflections, do not make all others black.
+
+    Args:
+        colors: Of any shape; some may not be finite.
+        fractions: Whether 1 may be white.
+    """
+    usual = np.quantile(np.append(colors[np.isfinite(colors) & (colors > 0)], 0), 0.9)
+    return next((white for white in (1, 255, 4095) if usual <= white and (fractions or white > 1)), 65535)
 
 
 def sh_coefficients(degree: int) -> int:
@@ -34,9 +49,9 @@ def sh_coefficients(degree: int) -> int:
     Raises:
         ValueError: ``degree`` is not in 0..3.
     """
-    if degree not in (0, 1, 2, 3):
+    if degree not in range(4):
         raise ValueError(f"the SH degree must be 0, 1, 2 or 3, got {degree}")
-    return (degree + 1) ** 2 - 1
+    return _COEFFICIENTS[degree]
 
 
 def shN_degree(coefficients: int) -> int:
@@ -45,10 +60,9 @@ def shN_degree(coefficients: int) -> int:
     Raises:
         ValueError: No degree from 0 to 3 has.
     """
-    degree = math.isqrt(max(coefficients, 0) + 1) - 1
-    if degree > 3 or sh_coefficients(degree) != coefficients:
+    if coefficients not in _COEFFICIENTS:
         raise ValueError(f"SH degrees 0 to 3 have 0, 3, 8 or 15 higher coefficients, got {coefficients}")
-    return degree
+    return _COEFFICIENTS.index(coefficients)
 
 
 # Squared quaternion norms are floored here, so that a zero quaternion is the identity and has no gradient.

@@ -120,8 +120,8 @@ class Splats(nn.Module):
         """One isotropic splat per point, as 3D Gaussian Splatting starts from a COLMAP model.
 
         No rotation, constant colour, axes as long as the root of the mean squared distance to the three nearest
-        neighbours (clamped to [1e-7, 4]). Non-finite and duplicate points are dropped: a duplicate
-        adds nothing and has no distance of its own.
+        neighbours; the square is clamped to [1e-7, 4], in squared units of ``points``. Non-finite and duplicate points
+        are dropped: a duplicate adds nothing and has no distance of its own.
 
         Args:
             points: World positions ``[N, 3]``.

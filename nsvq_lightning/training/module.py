@@ -219,7 +219,7 @@ class SplatModule(LightningModule):
         """
 
         def draws(*salts: str) -> torch.Generator:
-            # It lives on the CPU: quantizers draw a seed from it.
+            # It lives on the CPU: quantizers draw a seed from it. The 0 is a salt of before, which bits depend on.
             return generator(self.seed, self.global_step, 0, *salts, self._view_of_step)
 
         splats, quantizers = self.splats.raw(), self.quantizers
@@ -234,7 +234,9 @@ class SplatModule(LightningModule):
         return self.scene.render(splats, camera, **options)
 
     def setup(self, stage: str) -> None:
-        """Set the background and the extent of the scene.
+        """Refuse a trainer that cannot train splats; take background and, for a fit, cameras, frame and extent.
+
+        Splats that were given move into the frame, in place.
 
         Raises:
             ValueError: The trainer has another precision than ``32-true``, a device without kernels or, for a fit, no

@@ -1,6 +1,12 @@
 import pytest
 
-from nsvq_lightning.quantize import codebook_sizes
+from nsvq_lightning.quantize import QUANTIZED, codebook_sizes
+from nsvq_lightning.splats.attributes import ATTRIBUTES, QUANTIZABLE, attribute_dims
+
+
+def test_those_with_most_codes_come_first() -> None:
+    dims = attribute_dims(3)
+    assert list(QUANTIZED) == sorted(QUANTIZABLE, key=lambda name: (-ATTRIBUTES[name].code_share, dims[name]))
 
 
 def test_paper_sizes() -> None:

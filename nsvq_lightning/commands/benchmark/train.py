@@ -40,9 +40,15 @@ class StepClock(Callback):
         products: Matrix products in between, ms.
         psnr: Of the test views, in dB, at the end of the last run.
         splats: How many there are then.
+        kernels: What kernels did in parallel in each step.
+
+    Args:
+        regions: Where that is to be kept, what knows it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, regions: Regions | None = None) -> None:
+        self.regions = regions
+        self.kernels: list[list[Region]] = []
         self.steps: list[tuple[Phase, float]] = []
         self.products: list[float] = []
         self.psnr = 0.0
@@ -52,10 +58,14 @@ class StepClock(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the first step."""
+        if self.regions is not None:
+            self.regions.taken()
         self._since = time.perf_counter()
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *args: Any) -> None:
         """End a step, the work of a GPU included, and start the next; compare the test views after the last."""
+        if self.regions is not None:
+            self.kernels.append(self.regions.taken())
         timing.finish()
         took = 1000 * (time.perf_counter() - self._since)
         module = cast(SplatModule, pl_module)
@@ -80,31 +90,12 @@ class StepClock(Callback):
         """The mean step in matrix products, so that a busy machine is not mistaken for a slow variant."""
         return fmean(took for _, took in self.steps) / median(self.products)
 
-
-class RegionClock(StepClock):
-    """A clock that also keeps what kernels did in parallel in each step."""
-
-    def __init__(self, regions: Regions) -> None:
-        super().__init__()
-        self.regions = regions
-        self.kernels: list[list[Region]] = []
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start the first step."""
-        self.regions.taken()
-        super().on_train_start(trainer, pl_module)
-
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *args: Any) -> None:
-        """End a step, and start the next."""
-        self.kernels.append(self.regions.taken())
-        super().on_train_batch_end(trainer, pl_module, outputs, *args)
-
-    def expected(self, cores: int) -> StepClock:
+    def expected(self, cores: int) -> "StepClock":
         """What a clock would show with so many cores; with 0, what lies between the kernels."""
         clock = StepClock()
         for (phase, took), kernels in zip(self.steps, self.kernels, strict=True):
             seconds = took / 1000 - sum(whole for _, whole in kernels)
-            if cores:
+            if cores and self.regions is not None:
                 seconds += sum(makespan(parts, cores) + self.regions.wake * (cores > 1) for parts, _ in kernels)
             clock.steps.append((phase, 1000 * seconds))
         clock.products, clock.psnr, clock.splats = self.products, self.psnr, self.splats
@@ -182,7 +173,7 @@ def run(scope: Scope) -> Iterator[Measurement]:
         with switched(**variants[name]):
             _train(scope, clocks[name])
     if regions is not None:
-        parts = RegionClock(regions)
+        parts = StepClock(regions)
         regions.emulate(max(scope.emulate))
         for _ in range(rounds):
             _train(scope, parts)

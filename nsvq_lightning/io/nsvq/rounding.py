@@ -16,7 +16,7 @@ from nsvq_lightning.io.compressed import CompressedScene, slices
 from nsvq_lightning.io.morton import Grid
 from nsvq_lightning.io.nsvq.header import AttributeEntry
 from nsvq_lightning.io.nsvq.precision import Precision
-from nsvq_lightning.io.numbers import coarsest_power, nearest_power, opacity_of
+from nsvq_lightning.io.numbers import coarsest_power, opacity_of, power_above
 from nsvq_lightning.io.palette import mean_and_direction
 from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s, Integers, unit
 
@@ -87,7 +87,7 @@ def _coded(name: str, codes: Integers, codebook: Float32s, error: float) -> Stor
 
 def _step(rows: Float32s, wanted: float) -> float:
     """The power of two near ``wanted``, or the lattice which all values lie on already if it is not far finer."""
-    power = nearest_power(wanted)
+    power = power_above(wanted / math.sqrt(2.0))  # from √½ to √2 times as much
     lattice = coarsest_power(rows)
     return lattice if 4 * lattice >= power else power
 

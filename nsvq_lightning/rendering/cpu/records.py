@@ -34,7 +34,7 @@ SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_D
 
 # Elements of the camera array of `pack_camera`.
 ROTATION, TRANSLATION, POSITION, FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, WIDTH, HEIGHT, NEAR = (
-    0, 9, 12, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25,
+    0, 9, 12, *range(15, 26),
 )  # fmt: skip
 # Largest image side in pixels: a record has 16 bits, one of them the sign, for a tile's column or row.
 MAX_SIDE = TILE * (2**15 - 1)

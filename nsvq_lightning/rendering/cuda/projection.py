@@ -256,7 +256,8 @@ def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int, sampling: V
 
     Args:
         lens: The camera.
-        attributes: The six raw attributes, contiguous float32, in the order of :class:`~nsvq_lightning.RawSplats`.
+        attributes: The six raw attributes, contiguous float32, in the order of
+            :class:`~nsvq_lightning.splats.splats.RawSplats`.
         degree: Highest SH degree that is evaluated, at most the stored one.
         sampling: How the splats were trained, or None.
 

@@ -173,7 +173,7 @@ def test_more_cores_are_emulated_with_the_same_bits() -> None:
 
 def test_a_step_on_so_many_cores_is_what_lies_between_and_the_longest_queues() -> None:
     regions = SimpleNamespace(wake=0.25, taken=list)
-    clock = train.RegionClock(regions)  # type: ignore[arg-type]
+    clock = train.StepClock(regions)  # type: ignore[arg-type]
     clock.steps, clock.kernels = [(Phase.PRUNE, 9000.0)], [[([3.0, 1.0, 1.0], 5.5), ([0.5], 0.5)]]
     expected = {cores: clock.expected(cores).steps for cores in (0, 1, 2, 8)}
     between = 9 - 5.5 - 0.5
