@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.data import NO_FOLDER
 from nsvq_lightning.data import colmap_tables as tables
-from nsvq_lightning.splats.conventions import Float64s, Int64s, Uint8s
+from nsvq_lightning.splats.conventions import Float64s, Int64s, Uint8s, white_of
 
 log = logging.getLogger(__name__)
 
@@ -366,20 +366,15 @@ def size_range(cameras: Iterable[Any]) -> str:
 
 
 def rgb_bytes(values: Float64s, floats: bool = False) -> Uint8s:
-    """Colours ``[P, 3]`` of any kind as bytes: in [0, 1] if they are fractions, in [0, 255], or of 16 bits.
+    """Colours ``[P, 3]`` of any kind as bytes: in [0, 1] if they are fractions, in [0, 255], or of 12 or 16 bits.
 
     Args:
         values: The colours.
         floats: Whether they may be fractions even if all are 0 or 1.
     """
     values = np.nan_to_num(values)
-    largest = values.max(initial=0)
-    scale = 1.0
-    if largest <= 1 and (floats or (values % 1 != 0).any()):
-        scale = 255
-    elif largest > 255:
-        scale = 255 / 65535
-    return (values * scale).clip(0, 255).round().astype(np.uint8)
+    white = white_of(values, floats or bool((values % 1).any()))
+    return ((values / white).clip(0, 1) * 255).round().astype(np.uint8)
 
 
 def alignment(model: ColmapModel, other: ColmapModel) -> Float64s:

@@ -19,7 +19,7 @@ from nsvq_lightning.io.numbers import FLAT, Clamped, finite_logits, finite_logs,
 from nsvq_lightning.io.placing import FAR
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
-from nsvq_lightning.splats.conventions import SH_C0, ZERO, Arrays, Float32s, Float64s, Place
+from nsvq_lightning.splats.conventions import SH_C0, ZERO, Arrays, Float32s, Float64s, Place, white_of
 
 log = logging.getLogger(__name__)
 
@@ -326,7 +326,8 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
             rows[name][start : start + len(table), : part.shape[1]] = part
         start += len(table)
     if columns["sh0"] == _RGB:
-        rows["sh0"] = _coefficients(rows["sh0"], header.dtype["red"].kind == "f")
+        white = white_of(rows["sh0"], fractions=header.dtype["red"].kind == "f")
+        rows["sh0"] = ((rows["sh0"] / white - 0.5) / SH_C0).astype(np.float32)
     rows["scales"] = finite_logs(rows["scales"])
     # Writers that store opacity as a byte make 0 and 255 infinite logits.
     rows["opacities"] = finite_logits(rows["opacities"])

@@ -266,6 +266,25 @@ def test_colours_of_any_kind_are_bytes(values: tuple[float, ...], expected: tupl
     assert rgb_bytes(np.array([(1.0, 0, 1)]), floats=True).tolist() == [[255, 0, 255]]
 
 
+@pytest.mark.parametrize("odd", [1.004, 255.5, math.inf, math.nan, -3.0])
+@pytest.mark.parametrize("white", [1, 255, 4095, 65535])
+def test_a_single_odd_value_does_not_change_all_colours(white: int, odd: float) -> None:
+    levels = np.linspace(0, 1, 99).reshape(33, 3)
+    values = levels * white if white == 1 else (levels * white).round()
+    values[7, 2] = odd
+    found = rgb_bytes(values, floats=white == 1)
+    expected = np.rint(255 * levels)
+    kept = ~np.isclose(levels, levels[7, 2])
+    assert np.abs(found - expected)[kept].max() <= 1
+    assert rgb_bytes(np.zeros((0, 3))).shape == (0, 3)
+
+
+def test_colours_that_most_points_lack_are_bytes_still() -> None:
+    values = np.zeros((100, 3))
+    values[:5] = 200.5
+    assert rgb_bytes(values, floats=True)[:6].tolist() == [[200] * 3] * 5 + [[0] * 3]
+
+
 def test_missing_folder_and_missing_model(tmp_path: Path, make_scene: SceneFactory) -> None:
     with pytest.raises(SceneError, match="does not exist"):
         read_model(tmp_path / "nowhere")
