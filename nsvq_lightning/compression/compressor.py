@@ -134,8 +134,6 @@ WITH_PHOTOS = 4
 # Steps of a training.
 MIN_STEPS = 20
 USUAL_STEPS = 500
-# Steps of more splats than this are not timed, but taken to be in proportion: they would need the memory of a training.
-TIMED = 250_000
 # Where fewer splats than this share are left, and so many times as many steps: they have to cover what all did.
 THINNED = 0.97
 THINNING = 3
@@ -387,9 +385,9 @@ class Compressor:
 
     @cached_property
     def parts(self) -> int:
-        """In how many parts it is trained: as many as halves of halves have few enough splats."""
+        """In how many parts it is trained, each on its own pictures: as many halves of halves as are small enough."""
         most = AT_ONCE * (1 if self._is_own else WITH_PHOTOS)
-        return 1 << max(0, math.ceil(math.log2(len(self.scene) / most)))
+        return 1 << math.ceil(math.log2(len(self.scene) / AT_ONCE)) if len(self.scene) > most else 1
 
     def _train_parts(self, setting: Setting) -> CompressedScene:
         """Train the parts of a large scene, one after another, each with codebooks of its own.
@@ -436,8 +434,7 @@ class Compressor:
     @cached_property
     def _affordable(self) -> int:
         """How many steps the minutes are enough for."""
-        some = min(len(self.scene), TIMED)
-        seconds = iteration_seconds(self.data.scene, [(1.0, some)], best_device()) * len(self.scene) / some
+        seconds = iteration_seconds(self.data.scene, [(1.0, len(self.scene))], best_device())
         return int(min(60 * self.minutes / seconds, 1e9))
 
 

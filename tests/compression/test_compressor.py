@@ -13,8 +13,10 @@ from ring import cameras_around
 from splat_scenes import ball
 
 import nsvq_lightning as nl
+from nsvq_lightning.callbacks.forecast import grown
 from nsvq_lightning.compression.compressor import SLACK, Compressor, Setting, setting_for
 from nsvq_lightning.compression.viewpoints import Measure, own_scene, pictures
+from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io import CompressedScene
 from nsvq_lightning.io.nsvq.file import decode
 from nsvq_lightning.io.nsvq.header import unframe
@@ -266,6 +268,26 @@ def test_a_large_scene_is_trained_in_parts(monkeypatch: pytest.MonkeyPatch) -> N
     # Photos are of the whole.
     photos = replace(own_scene(scene.tensors(), whole.cameras), split="of a folder")
     assert Compressor(scene, (), photos).parts == 1
+    # Of too many splats for that, each part has its own pictures, and is as small as without photos.
+    monkeypatch.setattr("nsvq_lightning.compression.compressor.WITH_PHOTOS", 2)
+    assert Compressor(scene, (), photos).parts == 4
+
+
+def test_steps_are_limited_by_the_time_that_those_of_the_whole_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    timed = []
+
+    def seconds(scene: Scene, parts: list[tuple[float, int]], device: object) -> float:
+        timed.append(len(grown(scene, parts[0][1])))
+        return 0.001 * timed[-1]
+
+    monkeypatch.setattr("nsvq_lightning.compression.compressor.iteration_seconds", seconds)
+    scene = ball(600)
+    cameras = cameras_around(scene.means, 8, 80, 60)
+    assert Compressor(scene, cameras, minutes=0.5).usual_steps(600) == 50  # 0.6 s each
+    few = torch.rand(60, 3)
+    photos = replace(own_scene(scene.tensors(), cameras), split="of a folder", points=few, colors=few)
+    assert Compressor(scene, (), photos, minutes=0.5).usual_steps(600) == 50
+    assert timed == [600, 600]
 
 
 def test_bytes_are_kept_to_in_parts_too(monkeypatch: pytest.MonkeyPatch) -> None:
