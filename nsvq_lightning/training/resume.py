@@ -2,6 +2,7 @@
 
 import logging
 import re
+import shlex
 import sys
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, is_dataclass, replace
@@ -52,12 +53,12 @@ def changes(checkpoint: Mapping[str, Any], schedule: Schedule, own: Mapping[str,
     trained = checkpoint.get("hyper_parameters", {})
     kinds = ("callbacks.phases", checkpoint["schedule"], asdict(schedule)), ("model", trained, plain(own))
     changed = [
-        f"--{kind}.{name}={value}"
+        f"--{kind}.{name}={'null' if value is None else value}"
         for kind, stored, here in kinds
         for name, value in stored.items()
         if here.get(name, value) != value and name not in ("saved", "init_from")
     ]
-    return " ".join(changed).replace("callbacks.phases.total", "trainer.max_steps")
+    return shlex.join(changed).replace("callbacks.phases.total", "trainer.max_steps")
 
 
 def check_continuation(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import tempfile
 from dataclasses import replace
@@ -195,6 +196,15 @@ def test_another_schedule_is_told_of() -> None:
     assert others.split() == [
         "--trainer.max_steps=45000", "--callbacks.phases.min_reset_interval=11", "--model.antialiased=True",
     ]  # fmt: skip
+
+
+def test_the_options_that_are_told_can_be_pasted() -> None:
+    module = SplatModule(sh_degree=1)
+    stored: dict[str, Any] = {"state_dict": module.state_dict()}
+    module.on_save_checkpoint(stored)
+    stored["hyper_parameters"] = {"codebooks": None, "rates": {"means": 1e-4, "sh0": 2.0}}
+    told = changes(stored, module.schedule, {"codebooks": "4k", "rates": {}})
+    assert shlex.split(told) == ["--model.codebooks=null", "--model.rates={'means': 0.0001, 'sh0': 2.0}"]
 
 
 def check(checkpoint: dict[str, Any], module: SplatModule) -> None:
