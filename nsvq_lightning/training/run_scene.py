@@ -23,8 +23,8 @@ from nsvq_lightning.training.splat_scene import SplatScene
 log = logging.getLogger(__name__)
 
 # First splats of a run with a budget (docs/recipe.md): opacity; largest size in pixels of the nearest photo, as a lone
-# point would hide what is behind it.
-FIRST_OPACITY, MAX_PIXELS = 0.3, 50.0
+# point would hide what is behind it; and most points of those that there are, as a multiple of those to start with.
+FIRST_OPACITY, MAX_PIXELS, MOST_POINTS = 0.3, 50.0, 8
 
 
 def scene_of(trainer: Trainer | None) -> Scene | None:
@@ -158,13 +158,14 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
 def _with_dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     """Positions and colours ``[P, 3]`` of the points of SfM and, up to ``count``, of the dense start.
 
-    Those without colours stay only where that finds too few, or photos are white around their objects.
+    Those without colours stay only where that finds too few, or photos are white around their objects. Of many more
+    points than that, some are taken: splats get their sizes from the distances of these, and most would go.
     """
     fills = scene.grey and not scene.white
     known = 0 if fills else len(scene.points)
     if count <= known:
-        return scene.points, scene.colors
-    log.info("dense start: looking for %d points that neighbouring photos show", count - known)
+        most = MOST_POINTS * count or known
+        return spread(scene.points, most), spread(scene.colors, most)
     start = time.perf_counter()
     points, colors = dense_points(scene, count - known, seed)
     trim()

@@ -75,6 +75,18 @@ def test_points_without_colours_only_fill_up_what_photos_show(
         assert len(each) == 40
 
 
+@pytest.mark.parametrize(("known", "kept"), [(40, 40), (80, 80), (81, 41), (4000, 80)])
+def test_of_a_dense_cloud_some_points_are_taken(known: int, kept: int) -> None:
+    points = torch.arange(3.0 * known).view(known, 3)
+    scene: Any = SimpleNamespace(points=points, colors=points / points.max(), grey=False, white=False)
+    found, colors = run_scene._with_dense_points(scene, 10, 0)
+    assert len(found) == len(colors) == kept
+    assert torch.equal(found / points.max(), colors)
+    assert torch.equal(run_scene._with_dense_points(scene, 0, 0)[0], points)  # those of SfM alone
+    steps = found[:, 0].diff()
+    assert (steps == steps[0]).all()  # evenly spread
+
+
 def test_a_lone_point_before_the_cameras_does_not_hide_the_scene(make_scene: Callable[..., Path]) -> None:
     data = ColmapDataModule(str(make_scene()))
     scene = replace(data.scene, frame=Frame())
