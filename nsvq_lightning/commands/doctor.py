@@ -281,13 +281,15 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
     """Load the folder as a run does it, then check its split, its photos and their shape, and what a run will take."""
     from nsvq_lightning.data.images import same_shape
     from nsvq_lightning.data.points import in_picture
-    from nsvq_lightning.data.scene import ONE_PLACE, OTHER_SHAPE, load_scene
+    from nsvq_lightning.data.scene import ELSEWHERE, ONE_PLACE, OTHER_SHAPE, is_elsewhere, load_scene, spread
 
     scene = load_scene(root)
     train, test = len(scene.train), len(scene.test)
     text = f"{train} train and {test} test photos ({scene.split})"
     advice = "few; what lies between them is guessed, and the test score says little; take more photos"
     yield judged("split", text, advice, when=train < 20)
+    if is_elsewhere(scene):
+        yield Finding("problem", "points", f"they {ELSEWHERE}")
     if not scene.extent > 0:
         yield Finding("problem", "extent", f"all train photos {ONE_PLACE}")
     if (seen := model.observations) is not None:

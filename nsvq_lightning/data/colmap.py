@@ -111,6 +111,7 @@ class ColmapModel:
         source: Where it comes from, for messages.
         images_folder: Folder of the photos, where the model says so.
         test: Rows of the test images, where the model says so.
+        cloud: Whether the points are those of another file, which may be in other coordinates than the cameras.
         synthetic: Whether it is a NeRF-synthetic scene, whose transparent pixels are white by convention.
     """
 
@@ -122,6 +123,7 @@ class ColmapModel:
     source: str = "COLMAP"
     images_folder: str | None = None
     test: tuple[int, ...] | None = None
+    cloud: bool = False
     synthetic: bool = False
 
 

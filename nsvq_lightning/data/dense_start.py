@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from nsvq_lightning.data.images import edges_of, resized
-from nsvq_lightning.data.points import in_picture, projected
-from nsvq_lightning.data.scene import Scene, in_parallel, spread
+from nsvq_lightning.data.scene import Scene, colors_at, in_parallel
 from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.rendering.frame import EXTENT
 from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Uint8s
@@ -224,9 +223,8 @@ FAR_SHARE = 0.02
 FAR = 2.0
 # Share that is nearly all.
 NEARLY_ALL = 0.95
-# Most photos that colours are taken from; width in pixels of the square around a far point whose mean it is in a photo;
-# and of how many neighbouring points it is the mean then.
-COLORED_BY = 256
+# Width in pixels of the square around a far point whose mean colour it has in a photo; and of how many neighbouring
+# points it has the mean then.
 BLUR = 51
 ALIKE = 8
 
@@ -254,16 +252,7 @@ def far_points(scene: Scene, points: Tensor) -> tuple[Tensor, Tensor]:
     height, turn = 1 - 2 * steps / max(count, 1), math.pi * (1 + math.sqrt(5)) * steps
     circle = np.sqrt(1 - height**2)
     places = radius * np.stack([circle * np.cos(turn), circle * np.sin(turn), height], axis=1)
-    sums, photos, sightings = np.zeros(places.shape), np.zeros((count, 1)), 0
-    for index in spread(scene.train, COLORED_BY) if count else ():
-        (image, mask), camera = scene.images[index], scene.cameras[index]
-        rows = np.flatnonzero(in_picture(places, camera))
-        column, row, _ = projected(places[rows], camera)
-        pixels = row.astype(np.intp), column.astype(np.intp)
-        counts = np.ones((len(rows), 1)) if mask is None else mask.numpy()[pixels][:, None]
-        sums[rows] += counts * cv2.blur(image.numpy(), (BLUR, BLUR))[pixels]
-        photos[rows] += counts
-        sightings += len(rows)
+    sums, photos, sightings = colors_at(scene, places, BLUR)
     if photos.sum() <= sightings / 2:
         return torch.empty(0, 3), torch.empty(0, 3)
     shown = np.flatnonzero(photos)

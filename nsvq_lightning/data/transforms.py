@@ -61,7 +61,7 @@ def read_poses(
         return poses
     log.info("%s has no points in its COLMAP model: those of %s take their place", root, cloud)
     points, colors = read_points(cloud)
-    return replace(poses, points=points, colors=colors)
+    return replace(poses, points=points, colors=colors, cloud=True)
 
 
 def has_poses(root: Path) -> bool:
@@ -259,6 +259,7 @@ def _read_transforms(files: list[Path], allow_outside: bool) -> ColmapModel:
         source=files[0].name,
         images_folder=f"{files[0].parent.absolute()}/{folder}",  # keeps ".", beside which is no "._2"
         test=tuple(row for row, name in enumerate(names) if name in test) if is_split else None,
+        cloud=True,
         synthetic=files[0].name == "transforms_train.json",
     )
 

@@ -226,6 +226,19 @@ def test_points_without_colours_are_told(scene: Path) -> None:
     assert "without colours, 0 % far outliers" in _by_subject(scene)["points"].text
 
 
+def test_points_in_other_coordinates_are_a_problem(scene: Path) -> None:
+    points, colors = (values.numpy() for values in (load_scene(scene).points, load_scene(scene).colors))
+    (scene / "sparse/0/points3D.bin").unlink()
+    for turn, verdict in ([1, 1, 1], "note"), ([1, -1, -1], "problem"):
+        rows = (f"{x} {y} {z} {r} {g} {b}" for (x, y, z), (r, g, b) in zip(points * turn, colors, strict=True))
+        names = [f"property float {name}" for name in ("x", "y", "z", "red", "green", "blue")]
+        head = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *names, "end_header"]
+        (scene / "points3D.ply").write_text("\n".join([*head, *rows, ""]))
+        finding = _by_subject(scene)["points"]
+        assert finding.verdict == verdict
+        assert ("they are not where the photos show their colours" in finding.text) == (verdict == "problem")
+
+
 def test_poses_that_contradict_what_was_seen_are_a_problem(scene: Path) -> None:
     """Camera to world instead of world to camera, the commonest mistake in models that people write themselves."""
     pycolmap = import_pycolmap()

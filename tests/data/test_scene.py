@@ -23,8 +23,10 @@ from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_model
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.images import ImageHead
 from nsvq_lightning.data.photo_files import photos_below
+from nsvq_lightning.data.points import RANDOM_POINTS
 from nsvq_lightning.data.reconstruct import reconstruct
-from nsvq_lightning.data.scene import load_scene, spread, usable
+from nsvq_lightning.data.scene import is_elsewhere, load_scene, seen_by, spread, usable
+from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.training.module import SplatModule
 
 SceneFactory = Callable[..., Path]
@@ -261,6 +263,54 @@ def test_views_without_a_picture_are_left_out(
         (root / "images" / name).write_bytes(b"")
     with pytest.raises(SceneError, match=r"000\.png cannot be decoded"):
         usable(load_scene(root))
+
+
+CLOUD_ROW = [(axis, "<f8") for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+MOVES: dict[str, tuple[np.ndarray, float]] = {
+    "right": (np.eye(3), 0.0),
+    "turned": (np.diag([1.0, -1.0, -1.0]), 0.0),
+    "mirrored": (np.diag([-1.0, 1.0, 1.0]), 0.0),
+    "exchanged": (np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), 0.0),
+    "millimetres": (1000 * np.eye(3), 0.0),
+    "map": (np.eye(3), 5e5),
+}
+
+
+def cloud_scene(demo: Path, root: Path, move: str, gray: float | None = None) -> Path:
+    """The demo scene with its points in a file of their own, moved; ``gray``: contrast of intensities for colours."""
+    scene = load_scene(demo)
+    shutil.copytree(demo, root)
+    (root / "sparse/0/points3D.bin").unlink()
+    rows = np.zeros(len(scene.points), CLOUD_ROW)
+    turn, shift = MOVES[move]
+    for axis, values in zip("xyz", (scene.points.double().numpy() @ turn.T + shift).T, strict=True):
+        rows[axis] = values
+    for name, channel in zip(("red", "green", "blue"), scene.colors.T, strict=True):
+        rows[name] = (255 * channel).round() if gray is None else 128 + gray * scene.colors[:, 0]
+    write_elements(root / "points3D.ply", {"vertex": rows})
+    return root
+
+
+@pytest.mark.parametrize("move", MOVES)
+def test_points_that_are_not_where_photos_show_them_make_way(
+    demo_scene: Path, tmp_path: Path, move: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = load_scene(cloud_scene(demo_scene, tmp_path / "scene", move))
+    wrong = move != "right"
+    assert (scene.cloud, scene.grey, is_elsewhere(scene)) == (True, False, wrong)
+    found = usable(scene)
+    assert (found.grey, ("are not where the photos show their colours" in caplog.text)) == (wrong, wrong)
+    assert (len(found.points) == RANDOM_POINTS) == wrong
+    if wrong:
+        assert seen_by(found.train_cameras, found.points.numpy()).any(0).mean() > 0.9
+
+
+def test_points_are_taken_where_nothing_says_that_they_are_wrong(demo_scene: Path, tmp_path: Path) -> None:
+    for contrast, colourless in ((0.0, True), (100.0, False)):
+        scene = load_scene(cloud_scene(demo_scene, tmp_path / str(contrast), "turned", contrast))
+        assert (scene.cloud, scene.grey) == (True, colourless)
+        assert not is_elsewhere(scene)
+    assert not load_scene(demo_scene).cloud
 
 
 def test_home_is_a_tilde(make_scene: SceneFactory, monkeypatch: pytest.MonkeyPatch) -> None:
