@@ -16,6 +16,8 @@ from nsvq_lightning.random import draw_rows, generator
 from nsvq_lightning.rendering.frame import EXTENT
 from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Uint8s
 
+# Largest error in pixels, of the flow there and back again and of the triangulated point.
+MAX_ERROR = 0.7
 # Triangulated pixels: positions ``[M, 3]``, colours ``[M, 3]`` and detail ``[M]``, both in bytes.
 _Points = tuple[Float64s, Uint8s, Uint8s]
 
@@ -28,6 +30,8 @@ class _Photo(NamedTuple):
         counts: Which pixels count ``[h, w]``; None for all.
         rotation: World to camera ``[3, 3]``.
         depth: Median depth of the SfM points in front of the camera, scene units.
+        features: Pixels ``[F, 2]`` and descriptors ``[F, 128]``, whole numbers of about the same norm; none where there
+            are points of SfM.
     """
 
     image: Uint8s
@@ -39,6 +43,7 @@ class _Photo(NamedTuple):
     rotation: Float64s
     position: Float64s
     depth: float
+    features: tuple[Float64s, Float32s]
 
     def project(self, points: Float64s) -> tuple[Float64s, Float64s]:
         """Pixels ``[M, 2]`` and depths ``[M]`` of points ``[M, 3]``."""
@@ -66,8 +71,9 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
 
     The flow between each photo and its nearest neighbours (DIS, Kroeger et al. 2016) is followed there and back again,
     and the pixels that return are triangulated. From what several flows agree on, points are drawn in proportion to
-    the photos' detail. Test photos are not looked at. The same scene, count and seed give the same bits, on any number
-    of cores.
+    the photos' detail. Where the scene comes without points, features are found again, too, also where photos are too
+    far apart for the flow; where that finds nothing, they come first. Test photos are not looked at. The same scene,
+    count and seed give the same bits, on any number of cores.
 
     Args:
         scene: Its train photos, cameras and SfM points; these say how far away things are.
@@ -81,18 +87,20 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     Raises:
         SceneError: An image cannot be decoded.
     """
-    known = scene.points.double().numpy()
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # with several, DIS works in stripes, and its bits depend on how many
     try:
-        photos = in_parallel(lambda index: _photo(scene, index, known), scene.train, "dense start: photos")
-        pairs = _neighbours(photos)
+        photos = in_parallel(lambda index: _photo(scene, index), scene.train, "dense start: photos")
+        pairs = _neighbours(photos, *NEAR)
         pixels = 2 * len(pairs) * photos[0].grey.size
         stride = max(2, math.ceil(math.sqrt(pixels / MAX_CANDIDATES)))
-        found = in_parallel(lambda pair: _triangulated(*pair, stride), pairs, "dense start: flows")
+        found = in_parallel(lambda pair: _flows(*pair, stride), pairs, "dense start: flows")
+        by_flow = sum(len(points) for points, *_ in itertools.chain(*found))
+        pairs = _neighbours(photos, *WIDE) if scene.grey else []
+        found.append(in_parallel(lambda pair: _matched(*pair), pairs, "dense start: features"))
     finally:
         cv2.setNumThreads(threads)
-    if not found:
+    if not any(found):
         return torch.empty(0, 3), torch.empty(0, 3)
     edge = CELL * np.median([photo.depth for photo in photos])
     del photos, pairs
@@ -105,29 +113,40 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     _, cell, counts = np.unique(cells, return_inverse=True, return_counts=True)
     crowd = counts[cell]
     weight = np.where(crowd >= MIN_AGREEING, (detail / 255 + MIN_DETAIL) / crowd**CROWDED, 0)
+    # Several points of features where the flow finds nothing come first, whatever the draw.
+    weight[(np.bincount(cell[:by_flow], minlength=len(counts))[cell] == 0) & (crowd > 1)] = 1e30
     drawn = draw_rows(torch.from_numpy(weight), count, generator(seed, 0, "dense start")).numpy()
     return torch.from_numpy(positions[drawn]).float(), torch.from_numpy(colors[drawn]).float() / 255
 
 
 # Photos are looked at with at most so many pixels on their longer side.
 MAX_SIDE = 800
+# Most features of a photo (SIFT, Lowe 2004), those of the strongest contrast.
+MAX_FEATURES = 4000
 
 
-def _photo(scene: Scene, index: int, known: Float64s) -> _Photo:
+def _photo(scene: Scene, index: int) -> _Photo:
     camera = scene.cameras[index]
     image, mask = scene.images[index]
     scale = min(1.0, MAX_SIDE / max(camera.size))
     width, height = (round(side * scale) for side in camera.size)
     pixels, counts = resized(image.numpy(), None if mask is None else mask.numpy(), (width, height))
+    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    features = np.empty((0, 2)), np.empty((0, 128), np.float32)
+    if scene.grey:
+        sift = cv2.SIFT.create(MAX_FEATURES, enable_precise_upscale=True)
+        points, descriptors = sift.detectAndCompute(grey, None if counts is None else counts.view(np.uint8))
+        if points:
+            features = np.array([point.pt for point in points]) + 0.5, descriptors
     edges = edges_of(torch.from_numpy(pixels), None if counts is None else torch.from_numpy(counts))
     view = camera.viewmat.double().numpy()
     rotation, translation = view[:3, :3], view[:3, 3]
     size = np.array([width / camera.width, height / camera.height])
-    depths = known @ rotation[2] + translation[2]
+    depths = scene.points.double().numpy() @ rotation[2] + translation[2]
     ahead = depths[depths > 0]
     return _Photo(
         image=pixels,
-        grey=cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY),
+        grey=grey,
         detail=cv2.GaussianBlur((edges.strength() * 255).byte().numpy(), (0, 0), 1.5),
         counts=counts,
         focal=size * camera.intrinsics[:2],
@@ -135,18 +154,16 @@ def _photo(scene: Scene, index: int, known: Float64s) -> _Photo:
         rotation=rotation,
         position=-rotation.T @ translation,
         depth=float(np.median(ahead)) if len(ahead) else 0.0,
+        features=features,
     )
 
 
-# Least and largest distance of two cameras over the depth of what the first one sees.
-BASELINE = (0.02, 0.35)
-# Largest angle between their axes in degrees.
-MAX_TURNED = 25.0
-# Largest number of neighbours of a photo.
-MAX_NEIGHBOURS = 3
+# Largest distance of two cameras over the depth of what the first one sees, largest angle between their axes in
+# degrees, and most neighbours of a photo: for the flow, and for features.
+NEAR, WIDE = (0.35, 25.0, 3), (2.0, 60.0, 8)
 
 
-def _neighbours(photos: list[_Photo]) -> list[tuple[_Photo, _Photo]]:
+def _neighbours(photos: list[_Photo], baseline: float, turned: float, most: int) -> list[tuple[_Photo, _Photo]]:
     """Each photo with those nearest to it that see the same from another place, each pair once."""
     positions = np.array([photo.position for photo in photos])
     axes = np.array([photo.rotation[2] for photo in photos])
@@ -154,14 +171,14 @@ def _neighbours(photos: list[_Photo]) -> list[tuple[_Photo, _Photo]]:
     for i, photo in enumerate(photos):
         base = np.linalg.norm(positions - photo.position, axis=1)
         angle = np.degrees(np.arccos(np.clip(axes @ axes[i], -1, 1)))
-        least, largest = (share * photo.depth for share in BASELINE)
-        usable = (base > least) & (base < largest) & (angle < MAX_TURNED)
+        # Any nearer, there is no parallax.
+        usable = (base > 0.02 * photo.depth) & (base < baseline * photo.depth) & (angle < turned)
         nearest = np.argsort(np.where(usable, base + 0.01 * photo.depth * angle, np.inf), kind="stable")
-        pairs |= {(min(i, j), max(i, j)) for j in nearest[: min(MAX_NEIGHBOURS, usable.sum())].tolist()}
+        pairs |= {(min(i, j), max(i, j)) for j in nearest[: min(most, usable.sum())].tolist()}
     return [(photos[i], photos[j]) for i, j in sorted(pairs)]
 
 
-def _triangulated(a: _Photo, b: _Photo, stride: int) -> list[_Points]:
+def _flows(a: _Photo, b: _Photo, stride: int) -> list[_Points]:
     """What two photos show of each other: the pixels of the first, then those of the second."""
     height, width = np.maximum(a.grey.shape, b.grey.shape)
     first, second = (
@@ -172,14 +189,6 @@ def _triangulated(a: _Photo, b: _Photo, stride: int) -> list[_Points]:
     there = dis.calc(first, second, None)
     back = dis.calc(second, first, None)
     return [_followed(a, b, there, back, stride), _followed(b, a, back, there, stride)]
-
-
-# Largest error in pixels, of the flow there and back again and of the triangulated point.
-MAX_ERROR = 0.7
-# Least angle of the two rays in degrees.
-MIN_PARALLAX = 1.0
-# Least and largest depth of a point over the median depth of what SfM found in the photo.
-DEPTHS = (0.1, 20.0)
 
 
 def _followed(a: _Photo, b: _Photo, there: Float32s, back: Float32s, stride: int) -> _Points:
@@ -198,9 +207,28 @@ def _followed(a: _Photo, b: _Photo, there: Float32s, back: Float32s, stride: int
     rows, columns = (stride * found for found in np.nonzero(good[::stride, ::stride]))
     start = starts[rows, columns].astype(np.float64) + 0.5
     end = ends[rows, columns].astype(np.float64) + 0.5
+    return _triangulated(a, b, start, end)
+
+
+def _matched(a: _Photo, b: _Photo) -> _Points:
+    """Features of two photos that are most like each other, triangulated: some are not the same thing."""
+    (start, ours), (end, theirs) = a.features, b.features
+    alike = ours @ theirs.T  # exact, as all numbers are whole
+    first, second = np.nonzero((alike == alike.max(1, keepdims=True, initial=0)) & (alike == alike.max(0, initial=0)))
+    return _triangulated(a, b, start[first], end[second])
+
+
+# Least angle of the two rays in degrees.
+MIN_PARALLAX = 1.0
+# Least and largest depth of a point over the median depth of what SfM found in the photo.
+DEPTHS = (0.1, 20.0)
+
+
+def _triangulated(a: _Photo, b: _Photo, start: Float64s, end: Float64s) -> _Points:
+    """What is at pixels ``start [M, 2]`` of one photo and ``end [M, 2]`` of another, where that is one place."""
     u, v = a.rays(start), b.rays(end)
     apart = (u * v).sum(1) < np.cos(np.radians(MIN_PARALLAX))
-    rows, columns, start, end, u, v = (each[apart] for each in (rows, columns, start, end, u, v))
+    start, end, u, v = (each[apart] for each in (start, end, u, v))
     # The point nearest to both rays.
     cosine = (u * v).sum(1)
     between = b.position - a.position
@@ -214,7 +242,7 @@ def _followed(a: _Photo, b: _Photo, there: Float32s, back: Float32s, stride: int
     kept = (depths_a > least) & (depths_b > least) & (depths_a < largest)
     for pixels, expected in ((pixels_a, start), (pixels_b, end)):
         kept &= np.linalg.norm(pixels - expected, axis=1) < MAX_ERROR
-    rows, columns = rows[kept], columns[kept]
+    columns, rows = start[kept].astype(np.intp).T
     return points[kept], a.image[rows, columns], a.detail[rows, columns]
 
 

@@ -125,6 +125,37 @@ def test_photos_of_several_cameras_and_of_any_size(monkeypatch: pytest.MonkeyPat
     assert np.quantile(off_the_wall(points), 0.9) < 0.06
 
 
+# Farther apart than the flow is followed: 58 pixels of disparity at 0.25, 350 here.
+FAR_APART = (0.0, 1.5, 3.0)
+
+
+def test_without_points_features_are_found_where_photos_are_far_apart() -> None:
+    scene = scene_of([wall(512, 384, 230.0, x=x) for x in FAR_APART])
+    assert len(dense_points(scene, 1000, seed=0)[0]) == 0
+    points, colors = dense_points(replace(scene, grey=True), 10_000, seed=0)
+    assert 10_000 > len(points) == len(colors) > 1000
+    assert np.quantile(off_the_wall(points), 0.95) < 0.03
+    assert torch.equal(dense_points(replace(scene, grey=True), 10_000, seed=1)[0], points)  # all of them
+
+
+def test_of_few_points_those_of_features_come_first() -> None:
+    near, far = ([wall(512, 384, 230.0, x=x) for x in places] for places in ((-2.25, -2.0), (-0.5, 1.0, 2.5)))
+    scene = replace(scene_of([*near, *far]), grey=True)
+    by_flow = dense_points(replace(scene, grey=False), 10_000, seed=0)[0]
+    points = dense_points(scene, 10_000, seed=0)[0]
+    assert len(by_flow) == len(points) == 10_000
+    beyond = 2.5  # what the second photo shows
+    assert by_flow[:, 0].max() < beyond
+    expected = (points[:, 0] > beyond).float().mean()
+    # They crowd out those of the flow, not the other way round.
+    assert 0 < expected < (dense_points(scene, 1000, seed=0)[0][:, 0] > beyond).float().mean()
+
+
+def test_photos_without_features_do_without_them() -> None:
+    views = [wall(x=x, flat=1.0) for x in PLACES]
+    assert len(dense_points(replace(scene_of(views), grey=True), 1000, seed=0)[0]) == 0
+
+
 @pytest.mark.parametrize("places", [(0.0,), (0.0, 0.01, 0.02), (0.0, 9.0, 18.0)])
 def test_photos_without_neighbours_give_none(places: tuple[float, ...]) -> None:
     points, colors = dense_points(scene_of([wall(x=x) for x in places]), 1000, seed=0)
