@@ -227,14 +227,13 @@ def check_points(model: "ColmapModel") -> Iterator[Finding]:
 
     count = len(model.points)
     if not count:
-        text = f"none in {model.source}: random ones take their place, and training has more to do"
+        text = f"none in {model.source}: what photos have in common takes their place, and training has more to do"
         advice = "name a point cloud (ply_file_path in the file), or run COLMAP"
         yield judged("points", text, advice, when=not model.synthetic)
         return
     finite = model.points[np.isfinite(model.points).all(1)]
     if not len(finite):
-        program = "COLMAP" if model.source == "COLMAP" else "the export"
-        yield Finding("problem", "points", f"none is finite: run {program} again")
+        yield Finding("problem", "points", f"none of {count:,} is finite: export the model again")
         return
     far = astray(finite, 10).mean()
     text = f"{count:,}{'' if np.ptp(model.colors) else ', without colours'}, {100 * far:.2g} % far outliers"
@@ -293,7 +292,7 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
     if not scene.extent > 0:
         yield Finding("problem", "extent", f"all train photos {ONE_PLACE}")
     if (seen := model.observations) is not None:
-        points = model.points - scene.frame.origin
+        points, seen = model.points - scene.frame.origin, spread(seen, 20_000)
         shown = sum(
             np.count_nonzero(in_picture(points[seen[seen[:, 1] == row, 0]], camera))
             for row, camera in enumerate(scene.cameras)
