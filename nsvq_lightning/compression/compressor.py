@@ -348,7 +348,7 @@ class Compressor:
             sizes["shN"] += setting.more
         if self.parts > 1 and (sizes or setting.splats < len(self.scene)):
             return self._train_parts(setting)
-        steps = max(4, self.steps or self.usual_steps(setting.splats))
+        steps = 4 if self.stopped else max(4, self.steps or self.usual_steps(setting.splats))
         prune = steps // 4 if setting.splats < len(self.scene) else 0
         module = SplatModule(
             splats=self._splats,

@@ -114,6 +114,24 @@ def test_ctrl_c_keeps_what_was_reached(
     assert "ended the training early" in capsys.readouterr().err
 
 
+def test_ctrl_c_ends_all_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from nsvq_lightning.training.module import SplatModule
+
+    ends: dict[int, int] = {}
+
+    def interrupted(module: SplatModule, *_: object) -> None:
+        ends[len(ends) if module.global_step == 1 else len(ends) - 1] = module.global_step
+        if module.global_step == 30:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(SplatModule, "on_train_batch_end", interrupted, raising=False)
+    write_ply(tmp_path / "scene.ply", ball(2000))
+    output = tmp_path / "x/lod-meta.json"
+    assert main(["compress", str(tmp_path / "scene.ply"), str(output), "--levels=3", "--steps=50"]) == 130
+    assert list(ends.values()) == [30, 4]  # the finest level needs no training
+    assert len(read_scene(output)) == 2000
+
+
 def test_ctrl_c_before_there_are_codebooks_is_no_other_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
