@@ -280,15 +280,13 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
     """Load the folder as a run does it, then check its split, its photos and their shape, and what a run will take."""
     from nsvq_lightning.data.images import same_shape
     from nsvq_lightning.data.points import in_picture
-    from nsvq_lightning.data.scene import ELSEWHERE, ONE_PLACE, OTHER_SHAPE, is_elsewhere, load_scene, spread
+    from nsvq_lightning.data.scene import ONE_PLACE, OTHER_SHAPE, load_scene, spread
 
     scene = load_scene(root)
     train, test = len(scene.train), len(scene.test)
     text = f"{train} train and {test} test photos ({scene.split})"
     advice = "few; what lies between them is guessed, and the test score says little; take more photos"
     yield judged("split", text, advice, when=train < 20)
-    if is_elsewhere(scene):
-        yield Finding("problem", "points", f"they {ELSEWHERE}")
     if not scene.extent > 0:
         yield Finding("problem", "extent", f"all train photos {ONE_PLACE}")
     if (seen := model.observations) is not None:
@@ -312,7 +310,7 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
 def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     """Decode all photos, in parallel: whether that works, how much masks exclude, and which are not in the model."""
     from nsvq_lightning.data.photo_files import photos_below
-    from nsvq_lightning.data.scene import each_photo
+    from nsvq_lightning.data.scene import ELSEWHERE, each_photo, is_elsewhere
 
     # Share of the pixels that count, or what is wrong.
     found = each_photo(scene, lambda photo: 1.0 if photo.mask is None else float(photo.mask.float().mean()))
@@ -323,6 +321,8 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
         yield Finding("problem", "photos", f"{count - len(shares)} of {count} cannot be used; first: {first}")
     else:
         yield Finding("good", "photos", f"all {count} registered photos can be read")
+        if is_elsewhere(scene):
+            yield Finding("problem", "points", f"they {ELSEWHERE}")
     masked = {name: share for name, share in shares.items() if share < 1}
     if masked:
         left_out = 1 - sum(masked.values()) / len(masked)

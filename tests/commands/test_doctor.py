@@ -237,6 +237,12 @@ def test_points_in_other_coordinates_are_a_problem(scene: Path) -> None:
         finding = _by_subject(scene)["points"]
         assert finding.verdict == verdict
         assert ("they are not where the photos show their colours" in finding.text) == (verdict == "problem")
+    # A photo that cannot be read hides nothing else.
+    (scene / "images/view_001.png").write_bytes(b"")
+    found = _by_subject(scene)
+    assert "1 of 9 cannot be used" in found["photos"].text
+    assert "scene" not in found
+    assert "run time" in found
 
 
 def test_poses_that_contradict_what_was_seen_are_a_problem(scene: Path) -> None:
