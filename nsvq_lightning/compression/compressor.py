@@ -399,12 +399,12 @@ class Compressor:
         for number, rows in enumerate(np.array_split(spatial_order(self.scene.means), self.parts)):
             log.info("part %d of %d", number + 1, self.parts)
             part = self.scene.take(rows)
-            minutes, steps = self.minutes * len(part) / 1e6, 1 if self.stopped else self.steps
             cameras = viewpoints.showing(self._known, part.means, viewpoints.VIEWS)
-            own = Compressor(part, cameras, None, self.storage, self.seed, minutes, steps)
+            own = Compressor(part, cameras, None, self.storage, self.seed, self.minutes * len(part) / 1e6, self.steps)
+            own.stopped = self.stopped
             left = max(1, setting.splats * len(part) // len(self.scene))
             found.append(own._train(replace(setting, splats=left)))
-            self.stopped |= own.stopped
+            self.stopped = own.stopped
             del own, part
             trim()
         return replace(CompressedScene.joined(found), cameras=self.scene.cameras)

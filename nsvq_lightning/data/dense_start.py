@@ -87,10 +87,11 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     Raises:
         SceneError: An image cannot be decoded.
     """
+    known = scene.points.double().numpy()
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # with several, DIS works in stripes, and its bits depend on how many
     try:
-        photos = in_parallel(lambda index: _photo(scene, index), scene.train, "dense start: photos")
+        photos = in_parallel(lambda index: _photo(scene, index, known), scene.train, "dense start: photos")
         pairs = _neighbours(photos, *NEAR)
         pixels = 2 * len(pairs) * photos[0].grey.size
         stride = max(2, math.ceil(math.sqrt(pixels / MAX_CANDIDATES)))
@@ -125,7 +126,7 @@ MAX_SIDE = 800
 MAX_FEATURES = 4000
 
 
-def _photo(scene: Scene, index: int) -> _Photo:
+def _photo(scene: Scene, index: int, known: Float64s) -> _Photo:
     camera = scene.cameras[index]
     image, mask = scene.images[index]
     scale = min(1.0, MAX_SIDE / max(camera.size))
@@ -142,7 +143,7 @@ def _photo(scene: Scene, index: int) -> _Photo:
     view = camera.viewmat.double().numpy()
     rotation, translation = view[:3, :3], view[:3, 3]
     size = np.array([width / camera.width, height / camera.height])
-    depths = scene.points.double().numpy() @ rotation[2] + translation[2]
+    depths = known @ rotation[2] + translation[2]
     ahead = depths[depths > 0]
     return _Photo(
         image=pixels,

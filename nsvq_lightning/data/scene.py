@@ -278,7 +278,7 @@ def load_scene(
     sources = _image_sources(poses, files, mask_files, divisor, max_width if factor is None else None)
     poses, frame = _framed(poses, root, origin)
     cameras = tuple(_camera(image, source.pinhole, frame) for image, source in zip(poses.images, sources, strict=True))
-    grey = len(poses.points) > 0 and not np.ptp(poses.colors)
+    grey = poses.colors.size > 0 and not np.ptp(poses.colors)
     if grey:
         log.info("the points of %s have no colours: they start grey, behind those that photos show", root)
         poses = replace(poses, colors=np.full_like(poses.colors, 128))
@@ -425,7 +425,7 @@ def colors_at(scene: Scene, places: Float64s, width: int) -> tuple[Float64s, Flo
     Returns:
         Their sums ``[P, 3]`` in bytes and their numbers ``[P, 1]``, both of pixels that count, and how many there were.
     """
-    sums, photos, sightings = np.zeros(places.shape), np.zeros((len(places), 1)), 0
+    sums, photos, sightings = np.zeros_like(places), np.zeros((len(places), 1)), 0
     for index in spread(scene.train, SOME_CAMERAS) if places.size else ():
         (image, mask), camera = scene.images[index], scene.cameras[index]
         rows = np.flatnonzero(in_picture(places, camera))
