@@ -306,7 +306,7 @@ def load_scene(
         extent=extent,
         frame=frame,
         split=split,
-        white=poses.synthetic and (transparent or float(images[0].image[0].float().mean()) > 127),
+        white=poses.synthetic and (transparent or bool(np.quantile(images[0].image[0], 0.75) > 250)),
         grey=grey,
         cloud=poses.cloud,
     )

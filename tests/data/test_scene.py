@@ -518,7 +518,7 @@ def test_scenes_of_nerf_synthetic_are_in_front_of_white(demo_scene: Path, tmp_pa
         trainer.fit(SplatModule(sh_degree=0, codebooks=None, background="black"), ColmapDataModule(str(root)))
 
 
-@pytest.mark.parametrize(("behind", "white"), [(0, False), (255, True)])
+@pytest.mark.parametrize(("behind", "white"), [(0, False), (240, False), (255, True)])
 def test_opaque_photos_of_such_scenes_have_the_background_that_they_show(
     demo_scene: Path, tmp_path: Path, behind: int, white: bool
 ) -> None:
