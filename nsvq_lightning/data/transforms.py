@@ -78,12 +78,12 @@ def _files_in(root: Path) -> list[Path]:
 
 
 def _with_colmap_points(poses: ColmapModel, root: Path) -> ColmapModel:
-    """Cameras with the points of the only COLMAP model in the folder that they may have been made from, if any.
+    """Cameras with the points of the first COLMAP model in the folder, from which they may have been made, if any.
 
     Programs turn, move and scale that model; the photos that both have say how.
     """
     models = colmap.other_models(root)
-    if len(models) != 1:
+    if not models:
         return poses
     try:
         found = colmap.read_model(root, chosen=models[0])
@@ -230,13 +230,21 @@ def _read_transforms(files: list[Path], allow_outside: bool) -> ColmapModel:
         SceneError: A file is damaged, or has cameras or names that cannot be used.
     """
     head, frames = _frames(files[0], allow_outside)
+    if not frames:
+        raise SceneError(f"{files[0]} has no list of frames, so it has no cameras: export it again")
     train, test = _listed(head, frames)
     for file in files[1:]:
         _, tests = _frames(file, allow_outside)
+        # BlenderNeRF leaves test photos to be rendered: none is there, and the nearest names are those of train photos.
+        named = ((frame, frames.get(name, frame)) for name, frame in tests.items())
+        if not any(own.photo.is_file() and own.path("file_path") == one.path("file_path") for own, one in named):
+            log.warning("%s: none of its photos is there, so it is not used", file)
+            continue
         train, test = set(frames), set(tests)
         frames |= tests
     if train & test:
-        raise SceneError(f"{files[-1]}: {min(train & test)} is a train and a test photo: list it once")
+        twice = f"{min(train & test)} is a train and a test photo"
+        raise SceneError(f"{files[-1]}: {twice}: list it once, or choose one file (--data.model={files[0].name})")
     is_split = bool(train and test)
     names = sorted(train | test if is_split else frames)
     if len(names) < len(frames):
@@ -268,7 +276,7 @@ def _frames(file: Path, allow_outside: bool) -> tuple[Json, dict[str, _Frame]]:
     """The values of a file, and its frames by the names of their photos.
 
     Raises:
-        SceneError: It cannot be read or has no frames, one is no table of values, or two are of the same photo.
+        SceneError: It cannot be read or has no list of frames, one is no table of values, or two are of the same photo.
     """
     try:
         head = json.loads(file.read_bytes())
@@ -276,8 +284,8 @@ def _frames(file: Path, allow_outside: bool) -> tuple[Json, dict[str, _Frame]]:
         raise SceneError(f"{file} does not exist: choose another file (--data.model)") from error
     except (OSError, ValueError, RecursionError) as error:
         raise SceneError(f"{file} cannot be read ({error}): copy or export it again") from error
-    if not isinstance(head, dict) or not isinstance(head.get("frames"), list) or not head["frames"]:
-        raise SceneError(f"{file} has no list of frames, so it has no cameras: export it again")
+    if not isinstance(head, dict) or not isinstance(head.get("frames"), list):
+        raise SceneError(f"{file} has no list of frames: export it again")
     shared = {key: value for key, value in head.items() if key not in ("frames", "file_path", "mask_path")}
     given = []
     for position, own in enumerate(head["frames"]):

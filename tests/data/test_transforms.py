@@ -176,6 +176,14 @@ def test_blender_scenes_have_their_own_split_and_random_points(
     assert torch.equal(scene.points, load_scene(root).points)
     (root / "transforms_test.json").rename(root / "transforms_val.json")
     assert len(load_scene(root).test) == 3
+    unrendered = shutil.copytree(root, tmp_path / "unrendered")
+    shutil.rmtree(unrendered / "test")
+    for frames in ({}, {"frames": []}):  # the names that are left are those of train photos
+        caplog.clear()
+        change(unrendered / "transforms_val.json", **frames)
+        scene = load_scene(unrendered)
+        assert (len(scene.train), len(scene.test)) == (5, 1)
+        assert "transforms_val.json: none of its photos is there, so it is not used" in caplog.text
     train = root / "transforms_train.json"
     shutil.copy(train, root / "transforms_test.json")
     with pytest.raises(SceneError, match=r"transforms_test\.json: train/r_0\.png is a train and a test photo"):
@@ -296,6 +304,7 @@ def test_points_that_no_file_names_are_used(
     change(root / "transforms.json", applied_transform=None)
     if moved is not None:
         shutil.copytree(demo_scene / "sparse", root / "colmap/sparse")
+        shutil.copytree(demo_scene / "sparse/0", root / "colmap_text")  # instant-ngp leaves the same model twice
         (root / "points.ply").unlink()
     else:
         (root / "points.ply").rename(root / name)
