@@ -17,6 +17,8 @@ PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 # What names of folders of masks have in them.
 _OF_MASKS = re.compile("(?<!un)mask", re.IGNORECASE)
+# The same of folders whose pictures are no photos, unless a model names them.
+_NO_PHOTOS = re.compile("(?<!un)mask|depth|normal", re.IGNORECASE)
 
 
 def locate(
@@ -46,6 +48,8 @@ def locate(
         return paths
     taken = {*others, *(paths[name] for name in exact)}
     free = [path for path in photos_below(folder) if path not in taken]
+    if not any(map(_NO_PHOTOS.search, names)):
+        free = [path for path in free if not _NO_PHOTOS.search(str(path.parent.relative_to(folder)))]
     files = _Files(folder, free, whole=bool(exact))
     used: dict[Path, str] = {}
     for name in sorted(paths.keys() - exact):
@@ -144,7 +148,7 @@ def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]
     if (root / name).is_dir():
         return root / name, factor or 1
     plain = [given.replace("\\", "/") for given in names]
-    folders = [path for depth in ("*", "*/*") for path in sorted(root.glob(depth)) if not _OF_MASKS.search(path.name)]
+    folders = [path for depth in ("*", "*/*") for path in sorted(root.glob(depth)) if not _NO_PHOTOS.search(path.name)]
     found = [path for path in (root, *folders) if all((path / given).is_file() for given in plain)]
     if len(found) != 1:
         others = " and ".join(str(path.relative_to(root)) for path in found)

@@ -340,7 +340,7 @@ def _rows(scene: Path, query: str, *parameters: str) -> list[tuple[Any, ...]]:
     database = scene / DATABASE
     if not database.exists():
         return []
-    with contextlib.closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=rw", uri=True)) as connection:
+    with contextlib.closing(sqlite3.connect(database)) as connection:
         return connection.execute(query, parameters).fetchall()
 
 
@@ -349,8 +349,12 @@ CONVERTED = (".jfif", ".jpe", ".avif", ".heic", ".heif", ".hif", ".jxl", ".jp2",
 RAW = (".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 # Suffixes of videos.
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-# Names of folders that hold something else than photos, or the same photos again.
-OTHER = re.compile(r"\..*|__MACOSX|(.*_)?(masks?|depths?|normals?)|\.?thumb.*|images_\d+|sparse|runs", re.IGNORECASE)
+# Names of folders that hold something else than photos, or the same photos again, and of files that are such.
+OTHER = re.compile(
+    r"\..*|__MACOSX|(.*_)?(masks?|depths?|normals?)|confidence|corrected_images|\.?thumb.*|images_\d+|[248]x|sparse|runs",
+    re.IGNORECASE,
+)
+OTHER_FILES = re.compile(r"thumbnail|(thumb|conf|depth|mask)_\d+|.*\d_(mask|depth|normal)", re.IGNORECASE)
 
 
 def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
@@ -363,7 +367,8 @@ def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
     """
     suffixes = PHOTOS + CONVERTED + RAW
     files = [path for path in photos_below(folder, suffixes) if not path.name.startswith(".")]
-    files.sort(key=lambda path: (path.parent != folder, suffixes.index(path.suffix.lower()), path))
+    other = {path for path in files if _is_other(path.relative_to(folder))}
+    files.sort(key=lambda path: (path in other, path.parent != folder, suffixes.index(path.suffix.lower()), path))
     taken: dict[str, Path] = {}
     left = defaultdict(list)
     for path in files:
@@ -372,8 +377,8 @@ def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
             continue  # a scene, made of photos that are here
         if path.parent != files[0].parent == folder:
             reason = "in a folder beside the photos: give it alone, or put all photos into folders"
-        elif any(map(OTHER.fullmatch, inside.parts[:-1])):
-            reason = "no photos by the name of their folder"
+        elif path in other:
+            reason = "no photos by their names, or that of their folder"
         elif taken.setdefault(str(inside.with_suffix("")).casefold(), path) != path:
             reason = "another file of that name is taken"
         else:
@@ -382,6 +387,10 @@ def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
     if not taken:
         raise SceneError(f"{folder}: no photos; it must hold files that end in {', '.join(PHOTOS)}, or folders of them")
     return sorted(taken.values()), left
+
+
+def _is_other(inside: Path) -> bool:
+    return bool(any(map(OTHER.fullmatch, inside.parts[:-1])) or OTHER_FILES.fullmatch(inside.stem))
 
 
 def copy_photos(photos: Sequence[Path], source: Path, folder: Path, report: Report) -> tuple[list[str], LeftOut]:

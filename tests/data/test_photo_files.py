@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nsvq_lightning.data.colmap import ColmapImage, SceneError
+from nsvq_lightning.data.colmap import ColmapImage, NoPhotosError, SceneError
 from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder
 
 
@@ -81,6 +81,16 @@ def test_a_depth_map_is_not_taken_for_a_photo_that_is_gone(tmp_path: Path, suffi
     assert not second.exists()
     write(tmp_path / "scaled", "1.jpg", "2.png")  # here the suffix is that of all that there is
     assert locate(["1.jpg", "2.jpg"], tmp_path / "scaled", "the model")["2.jpg"] == tmp_path / "scaled/2.png"
+
+
+def test_maps_are_not_taken_for_photos_that_are_gone(tmp_path: Path) -> None:
+    write(tmp_path, "depths/1.png", "depths/2.png", "my_masks/1.png", "normals/1.png")
+    for name in ("images/1.png", "1.png"):
+        assert not locate([name], tmp_path, "the model")[name].exists()
+    with pytest.raises(NoPhotosError, match="no other folder"):
+        photo_folder(tmp_path, "images", None, ["1.png", "2.png"])
+    named = locate(["my_masks/1.PNG"], tmp_path, "the model")
+    assert named["my_masks/1.PNG"] == tmp_path / "my_masks/1.png"
 
 
 @pytest.mark.parametrize("place", [".", "input", "colmap/pictures", "sparse/0"])

@@ -277,6 +277,18 @@ def test_photos_of_folders_keep_apart(tmp_path: Path) -> None:
     assert sum(map(len, left.values())) == 6
 
 
+def test_what_apps_export_beside_photos_is_left_out(tmp_path: Path) -> None:
+    keyframes = [f"keyframes/{folder}/17.{kind}" for folder, kind in (("images", "jpg"), ("corrected_images", "jpg"))]
+    _touch(tmp_path / "polycam", "thumbnail.jpg", *keyframes, "keyframes/confidence/17.png", "keyframes/depth/17.png")
+    assert _names_in(tmp_path / "polycam")[0] == keyframes[:1]
+    _touch(tmp_path / "scans", "frame_00001.jpg", "thumb_00001.jpg", "conf_00001.png", "depth_00001.png", "1_depth.png")
+    names, left = _names_in(tmp_path / "scans")
+    assert names == ["frame_00001.jpg"]
+    assert list(left) == ["no photos by their names, or that of their folder"]
+    _touch(tmp_path / "nerfies", "rgb/1x/1.png", "rgb/2x/1.png", "rgb/4x/1.png")
+    assert _names_in(tmp_path / "nerfies")[0] == ["rgb/1x/1.png"]
+
+
 def test_copies_in_folders_keep_their_names(folders: tuple[Path, Path]) -> None:
     source, target = folders
     for name in ("left/1.png", "right/1.webp"):
