@@ -256,8 +256,8 @@ def continuation(checkpoint: Path) -> str:
     """The shell command that continues from a checkpoint, with the settings of the run that wrote it."""
     as_module = Path(sys.argv[0]).parts[-2:] == ("nsvq_lightning", "__main__.py")
     program = ["python", "-m", "nsvq_lightning"] if as_module else ["nsvq"]
-    folder = checkpoint.parents[1]
-    options = [f"--config={folder / 'config.yaml'}", f"--ckpt_path={checkpoint}", f"--trainer.run_folder={folder}"]
+    folder, path = checkpoint.parents[1].as_posix(), checkpoint.as_posix()
+    options = [f"--config={folder}/config.yaml", f"--ckpt_path={path}", f"--trainer.run_folder={folder}"]
     return shlex.join([*program, "fit", *options])
 
 
@@ -272,5 +272,5 @@ def summary(folder: Path, metrics: Json) -> str:
         f"  {metrics['num_splats']} splats in {metrics['file_bytes']} bytes (scene.nsvq), "
         f"{metrics['ratio']:.1f} times smaller than the plain .ply\n"
         f"  {metrics['train_seconds']:.0f} s of training\n"
-        f"look at it: {way}{shlex.join(['nsvq', 'view', str(folder)])}\n"
+        f"look at it: {way}{shlex.join(['nsvq', 'view', folder.as_posix()])}\n"
     )

@@ -83,7 +83,7 @@ def run(options: argparse.Namespace) -> int:
         few = f"{source}: {len(names)} pictures are too few, a scene takes 50 to 300"
         raise ValueError("; ".join([few, *remarks]))
     if find_model(source):
-        remarks.append(f"{source} has cameras already: nsvq fit --data.root {shlex.quote(str(source))} uses them")
+        remarks.append(f"{source} has cameras already: nsvq fit --data.root {shlex.quote(source.as_posix())} uses them")
     heads = {name: image_head(images / name) for name in names}
     say(*remarks, *reconstruct.oddities(heads))
     before = {*reconstruct.stamps_in(scene), *reconstruct.stamps_in(scene / "sparse")}
@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
     database = scene / reconstruct.DATABASE
     say(
         f"\n{database} ({database.stat().st_size / 1e6:.0f} MB) saves time when photos are added, and may be deleted",
-        f"next: nsvq fit --data.root {shlex.quote(str(scene))}",
+        f"next: nsvq fit --data.root {shlex.quote(scene.as_posix())}",
     )
     return 0
 

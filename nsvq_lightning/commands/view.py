@@ -9,6 +9,7 @@ Examples:
 
 import argparse
 import io
+import os
 import shutil
 import sys
 import tempfile
@@ -122,6 +123,8 @@ def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
 
 class _Server(ThreadingHTTPServer):
     """Says nothing of connections that break."""
+
+    allow_reuse_address = os.name != "nt"  # where it would share the port with another view
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         if not isinstance(sys.exception(), OSError):  # a client that hangs up, or takes nothing any more
