@@ -15,8 +15,8 @@ from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.random import draw_rows, generator, top_rows
 from nsvq_lightning.rendering.rasterize import Render
-from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
-from nsvq_lightning.splats.splats import RawSplats, detached
+from nsvq_lightning.rendering.reference import rotation_matrices
+from nsvq_lightning.splats.splats import RawSplats, detached, times_vectors
 from nsvq_lightning.training import distributed, row_ops, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase

@@ -16,9 +16,9 @@ from nsvq_lightning.data.scene import View, detailed_pixels
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.random import draw_rows, generator, top_rows
 from nsvq_lightning.rendering.rasterize import Render
-from nsvq_lightning.rendering.reference import rotation_matrices, times_vectors
+from nsvq_lightning.rendering.reference import rotation_matrices
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, codebook_bits
-from nsvq_lightning.splats.splats import RawSplats, detached
+from nsvq_lightning.splats.splats import RawSplats, detached, times_vectors
 from nsvq_lightning.training import distributed, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, Schedule

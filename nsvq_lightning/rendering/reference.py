@@ -14,7 +14,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.sampling import Layers, Shading, ViewSampling
 from nsvq_lightning.rendering.sh import sh_colors
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM
-from nsvq_lightning.splats.splats import RawSplats, SplatTensors
+from nsvq_lightning.splats.splats import RawSplats, SplatTensors, times_vectors
 
 
 class Projection(NamedTuple):
@@ -49,14 +49,6 @@ def rotation_matrices(quats: Tensor) -> Tensor:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
-
-
-def times_vectors(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """Products ``[N, I]`` of ``matrices [N, I, J]`` or one ``[I, J]`` and ``vectors [N, J]``.
-
-    Elementwise, in float32 wherever the inputs are: a GPU may round ``matmul`` and ``einsum`` to fewer digits (TF32).
-    """
-    return (matrices * vectors[:, None]).sum(2)
 
 
 def image_axes(

@@ -279,13 +279,17 @@ def canonical(scales: Tensor, quats: Tensor) -> Canonical:
     # The order fixes a rotation up to half turns around the axes; of these four, the one with the largest w.
     number = 2 * order[:, 0] + (order[:, 1] > order[:, 2])
     each = _TURNS.to(quats)
-    turns = each[number, _apply(each[:, :, 0][number], quats).abs().argmax(1)]
-    turned = _apply(turns, quats)
+    turns = each[number, times_vectors(each[:, :, 0][number], quats).abs().argmax(1)]
+    turned = times_vectors(turns, quats)
     signs = torch.where(turned[:, :1] < 0, -1.0, 1.0).to(quats)
     axes = torch.eye(3).to(scales)
     quat_maps = (signs * lengths)[:, :, None] * turns
     return Canonical(scales.gather(1, order), signs * turned / lengths, axes[order], quat_maps)
 
 
-def _apply(matrices: Tensor, rows: Tensor) -> Tensor:
-    return (matrices * rows[:, None, :]).sum(2)
+def times_vectors(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """Products ``[N, I]`` of ``matrices [N, I, J]`` or one ``[I, J]`` and ``vectors [N, J]``.
+
+    Elementwise, in float32 wherever the inputs are: a GPU may round ``matmul`` and ``einsum`` to fewer digits (TF32).
+    """
+    return (matrices * vectors[:, None]).sum(2)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from nsvq_lightning.splats.attributes import dropped, finite_rows, listed
-from nsvq_lightning.splats.splats import RawSplats, Splats, check_shapes
+from nsvq_lightning.splats.splats import RawSplats, Splats, check_shapes, times_vectors
 from nsvq_lightning.training.optim import find_group
 
 log = logging.getLogger(__name__)
@@ -104,7 +104,7 @@ def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: 
     replace_attribute(splats, name, values)
     for key, moment in _moments(optimizer, name).items():
         factors = maps if key in FIRST_MOMENTS else maps.square()
-        moment.copy_((factors * moment[:, None, :]).sum(2))
+        moment.copy_(times_vectors(factors, moment))
 
 
 def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -> None:
