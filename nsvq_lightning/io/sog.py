@@ -123,9 +123,9 @@ def write_sog(path: StrPath, scene: CompressedScene, *, palette: int = PALETTE_L
     """
     contents = sog_contents(scene.in_morton_order(), palette)
     with atomic_write(path) as file:
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        with zipfile.ZipFile(file, "w") as archive:
             for name, data in contents.items():
-                entry = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+                entry = zipfile.ZipInfo(name)  # of 1980, stored as it is
                 entry.create_system = 3  # otherwise that of the machine
                 archive.writestr(entry, data)
         return file.tell()
