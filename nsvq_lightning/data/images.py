@@ -346,7 +346,7 @@ def high_pass(image: Tensor, mask: Tensor | None, depth: int) -> Arrays:
     kernel[1, 1] = 8
     passed: Arrays = cv2.filter2D(grey, depth, kernel)
     if mask is not None:
-        passed *= cv2.erode(mask.cpu().numpy().view(np.uint8), np.ones((3, 3), np.uint8))
+        passed *= cv2.erode(mask.cpu().numpy().view(np.uint8), None)  # by 3 x 3
     return passed
 
 
