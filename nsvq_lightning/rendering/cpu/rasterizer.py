@@ -1,5 +1,6 @@
 """The CPU back-end as differentiable functions: projection, then binning and blend; statistics for density control."""
 
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
@@ -44,14 +45,10 @@ class _Frame:
         self.bands = 3 * splats.shN.shape[1], degree
         self.parts = parts_of(n, PROJECTED)
         self.work = Workspace.borrow()
+        weakref.finalize(self, self.work.give_back)
         self.records = self.work.array("records", rec.RECORD * n)
         self.integers = self.records.view(np.int32)
         self.sums = np.empty(0, np.float32)
-
-    def __del__(self) -> None:
-        work = getattr(self, "work", None)
-        if work is not None:
-            work.give_back()
 
     def find(self) -> tuple[Array, Array, Array]:
         """Write the records of the visible splats; returns a run of rows, and the rows and slots, of each part."""
