@@ -105,16 +105,15 @@ def _tree(levels: Sequence[CompressedScene]) -> tuple[Json, list[tuple[list[Inte
     def node(splats: Integers) -> Json:
         low, high = boxes[splats, 0].min(0), boxes[splats, 1].max(0)
         found: Json = {"bound": {"min": _decimals(low), "max": _decimals(high)}}
-        finest, *coarser = np.split(splats, np.searchsorted(splats, starts[1:-1]))
+        of_levels = np.split(splats, np.searchsorted(splats, starts[1:-1]))
+        finest = of_levels[0]
         axis = means[finest].std(0).argmax()
         below = means[splats, axis] < np.median(means[finest, axis])
         if len(finest) > LEAF and below[: len(finest)].any():
             found["children"] = [node(splats[below]), node(splats[~below])]
             return found
         found["lods"] = {}
-        rows = []
-        for each, start in zip((finest, *coarser), starts, strict=False):
-            rows.append(each[spatial_order(means[each])] - start)
+        rows = [each[spatial_order(means[each])] - start for each, start in zip(of_levels, starts, strict=False)]
         leaves.append((rows, found))
         return found
 
