@@ -195,10 +195,7 @@ def _cut(rows, order):  # type: ignore[no-untyped-def]
     for i in range(count):
         for j in range(rows.shape[1]):
             projections[i] += rows[order[i], j] * direction[j]
-    places = np.argsort(projections, kind="mergesort")
-    before = order.copy()
-    for i in range(count):
-        order[i] = before[places[i]]
+    order[:] = order[np.argsort(projections, kind="mergesort")]
     middle = (count + 1) // 2
     _cut(rows, order[:middle])
     _cut(rows, order[middle:])
