@@ -6,8 +6,7 @@ Windows, it writes small text files instead; this module then finds the folders 
 
 import sys
 from importlib.abc import MetaPathFinder
-from importlib.machinery import ModuleSpec
-from importlib.util import spec_from_file_location
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -23,19 +22,13 @@ def folder_of(name: str) -> Path:
 
 def find_callbacks() -> None:
     """Make ``nsvq_lightning.callbacks`` importable from where it is; does nothing if that is the package."""
-    folder = folder_of("callbacks")
-    if folder.parent != _PACKAGE:
-        sys.meta_path.append(_Finder(f"{_PACKAGE.name}.callbacks", folder))
+    if folder_of("callbacks").parent != _PACKAGE:
+        sys.meta_path.append(_Finder())
 
 
 class _Finder(MetaPathFinder):
-    """Finds one package in a folder; its modules are found as usual."""
-
-    def __init__(self, name: str, folder: Path) -> None:
-        self._name, self._folder = name, folder
+    """Finds the callbacks at the top level; their modules are found as usual."""
 
     def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> ModuleSpec | None:
-        if fullname != self._name:
-            return None
-        start = self._folder / "__init__.py"
-        return spec_from_file_location(fullname, start, submodule_search_locations=[str(self._folder)])
+        is_ours = fullname == f"{_PACKAGE.name}.callbacks"
+        return PathFinder.find_spec(fullname, [str(_PACKAGE.parent)]) if is_ours else None
