@@ -23,7 +23,7 @@ _IDLE: list["Workspace"] = []
 
 def flat(tensor: Tensor) -> Array:
     """The elements of a CPU tensor in row-major order: its own memory, or a copy where that is not contiguous."""
-    return tensor.detach().contiguous().numpy().reshape(-1)
+    return tensor.detach().ravel().numpy()
 
 
 def check_array(name: str, array: Array, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
@@ -63,7 +63,7 @@ def flat_checked(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: np.dt
     """The memory of a tensor on the CPU, row by row, after :func:`check_array`."""
     array = tensor.detach().numpy()
     check_array(name, array, shape, dtype)
-    return array.reshape(-1)
+    return array.ravel()
 
 
 def check_inside(name: str, numbers: Array, count: int) -> None:

@@ -140,7 +140,7 @@ def in_order_of_use(rows: Float32s, labels: Integers) -> tuple[Float32s, Int64s]
     """
     used, labels = np.unique_inverse(labels)
     distinct, same = np.unique(rows[used], axis=0, return_inverse=True)
-    labels = same.reshape(-1)[labels]  # its shape differs between releases of NumPy
+    labels = same.ravel()[labels]  # its shape differs between releases of NumPy
     _, first = np.unique(labels, return_index=True)
     order = first.argsort()
     return distinct[order], order.argsort()[labels]

@@ -407,7 +407,7 @@ def read_spz(path: StrPath) -> CompressedScene:
         antialiased=bool(header.flags & ANTIALIASED),
     )
     if arrays["tree"].size:
-        scene = scene.take(np.flatnonzero(arrays["tree"].reshape(-1)[: 2 * header.count].view("<u2") == 0))
+        scene = scene.take(np.flatnonzero(arrays["tree"].ravel()[: 2 * header.count].view("<u2") == 0))
         logger.info("%s: levels of detail; the finest is read, %d of %d splats", path, len(scene), header.count)
     # Signs first, then the turn, as Niantic's library does it, which writes such files.
     return rotated(scene, UP_AXES["z"]) if system > 8 else scene

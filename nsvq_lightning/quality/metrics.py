@@ -29,7 +29,7 @@ def color_corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) ->
     """
     colors = image.reshape(-1, 3).double()
     target = photo.reshape(-1, 3).double()
-    counting = torch.ones_like(colors[:, 0], dtype=torch.bool) if mask is None else mask.reshape(-1)
+    counting = torch.ones_like(colors[:, 0], dtype=torch.bool) if mask is None else mask.ravel()
     dark, bright = 0.5 / 255, 1 - 0.5 / 255  # beyond these, a pixel is clipped and says nothing about the map
     seen = counting[:, None] & (target >= dark) & (target <= bright)
     parts = [slice(start, start + AT_ONCE) for start in range(0, len(colors), AT_ONCE)]

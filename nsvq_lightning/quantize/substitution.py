@@ -313,5 +313,5 @@ def substitute_backward(
     tables = map(flat, (grad, x, rows, codebook, codes, out, grad_x))
     if _backward(x.shape[1])(parts, *tables, sums):
         _check_inside(x, rows, codebook, codes)
-    np.add.reduce(sums, axis=0, out=grad_codebook.numpy().reshape(-1))
+    np.add.reduce(sums, axis=0, out=grad_codebook.numpy().ravel())
     return grad_x, grad_codebook

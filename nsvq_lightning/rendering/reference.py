@@ -158,7 +158,7 @@ def render(splats: RawSplats, camera: Camera, shading: Shading) -> Layers:
             near = order[here]
             down, across = torch.arange(top, bottom).to(centres), torch.arange(left, right).to(centres)
             pixels = torch.cartesian_prod(down, across).flip(1) + 0.5
-            weights_here = pixel_weights[top:bottom, left:right].reshape(-1)
+            weights_here = pixel_weights[top:bottom, left:right].ravel()
             inputs = (
                 pixels, centres[near], projection.conics[near], projection.opacities[near], features[near],
                 weights_here, watched[near],

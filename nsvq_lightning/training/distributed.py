@@ -49,7 +49,7 @@ def checksum(tensor: Tensor) -> Tensor:
     Args:
         tensor: Float32, any shape.
     """
-    bits = tensor.contiguous().view(-1).view(torch.int32).long()
+    bits = tensor.ravel().view(torch.int32).long()
     return (bits * torch.arange(1, len(bits) + 1, device=bits.device)).sum()
 
 

@@ -79,7 +79,7 @@ def _coded(name: str, codes: Integers, codebook: Float32s, error: float) -> Stor
     distance = sibling_distance(distinct[tree_order(distinct)])
     step = _step(rows, 2 * error * distance or 2.0**-16)
     integers, merged = np.unique(_integers(name, rows, step), axis=0, return_inverse=True)
-    merged_codes = merged.reshape(-1)[np.cumsum(used)[codes] - 1]
+    merged_codes = merged.ravel()[np.cumsum(used)[codes] - 1]
     order = tree_order((integers * step).astype(np.float32))
     entry = AttributeEntry(name, rows.shape[1], "codes", len(integers), step)
     return Stored(entry, order.argsort()[merged_codes], integers[order])
