@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nsvq_lightning.compute.jit import in_parallel, inline, kernel, parallel
+from nsvq_lightning.compute.jit import in_parallel, inline, kernel
 from nsvq_lightning.compute.rows import share
 from nsvq_lightning.compute.simd import get, prefetch, put
 from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES
@@ -119,7 +119,10 @@ def count_tiles(parts, count, order, boxes, group_columns, histogram, offsets):
     return total
 
 
-@parallel
-def fill_tiles(part, parts, count, order, boxes, group_columns, histogram, ids, entries):
-    """Write the row of every splat (``ids``, by place) into the lists of its tiles, keeping the order."""
-    _visit_tiles(part, parts, count, order, boxes, group_columns, histogram, ids, entries)
+@kernel
+def fill_tiles(parts, *arguments):
+    """Write the row of every splat (``ids``, by place) into the lists of its tiles, keeping the order.
+
+    The arguments are those of :func:`count_tiles` without the offsets, then ``ids`` and the lists.
+    """
+    in_parallel(_visit_tiles, parts, arguments)
