@@ -341,12 +341,12 @@ def high_pass(image: Tensor, mask: Tensor | None, depth: int) -> Arrays:
         mask: Which pixels count ``[H, W]`` bool; None if all do.
         depth: OpenCV's name of the type of the result.
     """
-    grey = cv2.cvtColor(image.cpu().numpy(), cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(image.numpy(force=True), cv2.COLOR_RGB2GRAY)
     kernel = np.full((3, 3), -1, np.float32)
     kernel[1, 1] = 8
     passed: Arrays = cv2.filter2D(grey, depth, kernel)
     if mask is not None:
-        passed *= cv2.erode(mask.cpu().numpy().view(np.uint8), None)  # by 3 x 3
+        passed *= cv2.erode(mask.numpy(force=True).view(np.uint8), None)  # by 3 x 3
     return passed
 
 

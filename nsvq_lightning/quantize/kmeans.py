@@ -160,7 +160,7 @@ def mean_by_code(x: Tensor, codes: Tensor, codebook: Tensor, weight: Tensor | No
 
 def distinct_rows(x: Tensor) -> Tensor:
     """Indices ``[M]`` int64, ascending, of the first occurrence of every distinct row of ``x [N, D]``."""
-    rows = (x.detach().cpu() + 0.0).contiguous().numpy()  # + 0.0 turns -0 into 0
+    rows = (x + 0.0).contiguous().numpy(force=True)  # + 0.0 turns -0 into 0
     # As bytes: NumPy would compare the rows of a table number by number, ten times as slowly.
     _, first = np.unique(rows.view(f"V{rows.itemsize * rows.shape[1]}"), return_index=True)
     return torch.from_numpy(np.sort(first)).to(x.device)

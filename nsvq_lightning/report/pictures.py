@@ -72,7 +72,7 @@ def comparison(image: Tensor, photo: Tensor) -> Tensor:
 
 def as_bytes(image: Tensor) -> Uint8s:
     """An image ``[H, W, 3]`` in [0, 1] with 8 bits."""
-    return (image.clamp(0.0, 1.0) * 255).round().to(torch.uint8).cpu().numpy()
+    return (image.clamp(0.0, 1.0) * 255).round().byte().numpy(force=True)
 
 
 def write_png(path: Path, image: Tensor) -> None:

@@ -54,7 +54,7 @@ def row_weights(contribution: Tensor, least: float = 0.01) -> Tensor:
     The smallest weight is ``least`` times the mean contribution.
     """
     # Not torch's mean, whose last bits depend on the number of threads.
-    mean = float(contribution.cpu().numpy().mean(dtype=np.float64))
+    mean = float(contribution.numpy(force=True).mean(dtype=np.float64))
     return contribution + max(least * mean, torch.finfo(contribution.dtype).tiny)
 
 

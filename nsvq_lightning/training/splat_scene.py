@@ -146,4 +146,4 @@ def to_compressed(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> Com
 
 
 def _numpy(tensor: Tensor) -> Arrays:
-    return tensor.detach().cpu().numpy()
+    return tensor.numpy(force=True)
