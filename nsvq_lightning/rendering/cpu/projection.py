@@ -3,7 +3,7 @@
 import numpy as np
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import F, inline, parallel
+from nsvq_lightning.compute.jit import F, parallel
 from nsvq_lightning.compute.rows import clear, load_numbers, load_quats, load_vectors, vector_share
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import color_range
@@ -13,16 +13,20 @@ from nsvq_lightning.rendering.formulas import footprint, view_point
 PROJECTION_SCRATCH = 128 + 16 * rec.RECORD
 
 
-@inline
-def project_range(camera, sampling, means, quats, scales, logits, first, last, records, integers, ids):
-    """Write the records of a range's visible splats; returns how many there are and how many slots they need.
+@parallel
+def project_splats(
+    part, parts, camera, sampling, means, quats, scales, logits, records, integers, found, counts, slots
+):
+    """Write the records of the visible splats of a range.
 
+    ``found`` gets a run of rows for each range, ``counts`` how many there are, ``slots`` how many slots they need.
     ``sampling`` are nearest and farthest distances, and the size, or None.
     """
+    first, last = vector_share(logits.shape[0], part, parts)
     scratch = simd.scratch(PROJECTION_SCRATCH)
     zero = simd.broadcast(0)
     visible = 0
-    slots = 0
+    needed = 0
     for start in range(first, last, 16):
         count = min(16, last - start)
         mean = load_vectors(means, start, count)
@@ -59,26 +63,15 @@ def project_range(camera, sampling, means, quats, scales, logits, first, last, r
             simd.store(records, o, simd.load(scratch, 128 + 16 * lane))
             x0, y0 = np.int64(simd.get(scratch, lane)), np.int64(simd.get(scratch, 16 + lane))
             x1, y1 = np.int64(simd.get(scratch, 32 + lane)), np.int64(simd.get(scratch, 48 + lane))
-            simd.put(integers, o + rec.SLOT, slots)
+            simd.put(integers, o + rec.SLOT, needed)
             simd.put(integers, o + rec.ORIGIN, x0 | (y0 << 16))
             simd.put(integers, o + rec.EXTENT, (x1 - x0 + 1) | ((y1 - y0 + 1) << 16))
             simd.put(integers, o + rec.RADIUS, np.int64(min(simd.get(scratch, 64 + lane), F(1e9))))
             columns = (x1 >> rec.GROUP_SHIFT) - (x0 >> rec.GROUP_SHIFT) + 1
-            slots += columns * ((y1 >> rec.GROUP_SHIFT) - (y0 >> rec.GROUP_SHIFT) + 1)
-            simd.put(ids, first + visible, row)
+            needed += columns * ((y1 >> rec.GROUP_SHIFT) - (y0 >> rec.GROUP_SHIFT) + 1)
+            simd.put(found, first + visible, row)
             visible += 1
-    return visible, slots
-
-
-@parallel
-def project_splats(
-    part, parts, camera, sampling, means, quats, scales, logits, records, integers, found, counts, slots
-):
-    """Write the records of the visible splats of a range; ``found`` gets a run of rows for each."""
-    first, last = vector_share(logits.shape[0], part, parts)
-    counts[part], slots[part] = project_range(
-        camera, sampling, means, quats, scales, logits, first, last, records, integers, found
-    )
+    counts[part], slots[part] = visible, needed
 
 
 @parallel

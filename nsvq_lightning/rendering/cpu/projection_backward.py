@@ -30,7 +30,7 @@ def project_backward(
 
     ``sums[16·slot]`` of a splat's first slot holds its total; ``g_means2d [N·2]`` the gradient of its projected centre.
     ``geometry`` are means, quaternions, log-scales and logits, ``bands`` as in ``add_colors``, ``sampling`` as in
-    ``project_range``.
+    ``project_splats``.
     """
     means, quats, scales, logits = geometry
     g_means, g_quats, g_scales, g_logits, g_sh0, g_shN = gradients
