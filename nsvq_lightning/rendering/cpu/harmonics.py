@@ -3,8 +3,8 @@
 import numpy as np
 
 from nsvq_lightning.compute import simd
-from nsvq_lightning.compute.jit import inline
-from nsvq_lightning.compute.rows import clear
+from nsvq_lightning.compute.jit import inline, parallel
+from nsvq_lightning.compute.rows import clear, vector_share
 from nsvq_lightning.rendering import formulas
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.formulas import C0, bands1, bands2, bands3, unit_direction
@@ -73,9 +73,13 @@ def color(degree, d, sh0, columns):
     return rgb
 
 
-@inline
-def color_range(camera, means, colors, bands, ids, first, last, records):
-    """Write colours to the records of ``ids[first:last]``; the list is padded to whole vectors."""
+@parallel
+def add_colors(part, parts, camera, means, colors, bands, ids, count, records):
+    """Write the colours of the visible splats to their records; ``ids`` are padded to whole vectors.
+
+    ``colors`` are sh0 and shN, ``bands`` the floats in a row of shN and the degree that counts.
+    """
+    first, last = vector_share(count, part, parts)
     scratch = simd.scratch(COLUMNS)
     (sh0, shN), (stride, degree) = colors, bands
     coefficients = coefficients_of(degree)

@@ -6,7 +6,6 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, parallel
 from nsvq_lightning.compute.rows import clear, load_numbers, load_quats, load_vectors, vector_share
 from nsvq_lightning.rendering.cpu import records as rec
-from nsvq_lightning.rendering.cpu.harmonics import color_range
 from nsvq_lightning.rendering.formulas import footprint, view_point
 
 # Floats between a lane of vectors and the records that they become.
@@ -111,13 +110,3 @@ def join_runs(part, parts, runs, records, integers, listed, means2d, radii):
     if start + counts[part] == total and counts[part] > 0:
         for k in range(16):
             simd.put(ids, total + k, simd.get(ids, total - 1))
-
-
-@parallel
-def add_colors(part, parts, camera, means, colors, bands, ids, count, records):
-    """Write the colours of the visible splats to their records.
-
-    ``colors`` are sh0 and shN, ``bands`` the floats in a row of shN and the degree that counts.
-    """
-    first, last = vector_share(count, part, parts)
-    color_range(camera, means, colors, bands, ids, first, last, records)

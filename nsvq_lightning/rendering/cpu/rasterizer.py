@@ -14,7 +14,7 @@ from nsvq_lightning.compute.memory import INT32, Array, Workspace, flat, flat_ch
 from nsvq_lightning.compute.rows import clear_all, share, vector_share
 from nsvq_lightning.compute.simd import get, put
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.cpu import binning, projection, projection_backward
+from nsvq_lightning.rendering.cpu import binning, harmonics, projection, projection_backward
 from nsvq_lightning.rendering.cpu import blend as blending
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.sampling import Layers, Shading, ViewSampling
@@ -69,7 +69,7 @@ class _Frame:
         self.boxes = self.work.array("boxes", self.count, np.int64)
         listed = self.ids, keys, order, self.boxes
         projection.join_runs(self.parts, (found, counts, slots), self.records, self.integers, listed, means2d, radii)
-        projection.add_colors(
+        harmonics.add_colors(
             self.parts, self.camera, self.geometry[0], self.colors, self.bands, self.ids, self.count, self.records
         )
         if self.count:
