@@ -214,8 +214,26 @@ def write_block(block, corner, size, background, state, planes):
 
 
 @inline
-def blend_tile(records, entries, begin, end, corner, size, background, grid, touched, planes, state, cull_blocks):
-    """Blend one tile; returns the end of the part of its list that was processed."""
+def tile_corner(tile, group_columns):
+    """Left and top pixel of a tile."""
+    group, inside = tile // rec.GROUP_TILES, tile % rec.GROUP_TILES
+    side = 1 << rec.GROUP_SHIFT
+    x = (group % group_columns) * side + inside % side
+    y = (group // group_columns) * side + inside // side
+    return x * TILE, y * TILE
+
+
+@parallel
+def blend(
+    tile, tiles, records, entries, offsets, group_columns, size, background, grid, touched, ends, planes, cull_blocks
+):  # fmt: skip
+    """Blend a tile; a pixel depends only on its own one.
+
+    ``ends`` gets the end of the part of its list that was processed. ``size`` is width and height, ``planes`` are
+    image, transmittance and depth. ``cull_blocks`` says whether to skip the blocks that a splat cannot reach.
+    """
+    begin, end = np.int64(offsets[tile]), np.int64(offsets[tile + 1])
+    corner, state = tile_corner(tile, group_columns), simd.scratch(FORWARD_SCRATCH)
     columns, rows = F(size[0] - corner[0]), F(size[1] - corner[1])
     alive = 0
     for block in range(BLOCKS):
@@ -260,33 +278,7 @@ def blend_tile(records, entries, begin, end, corner, size, background, grid, tou
         i += count
     for block in range(BLOCKS):
         write_block(block, corner, size, background, state, planes)
-    return i
-
-
-@inline
-def tile_corner(tile, group_columns):
-    """Left and top pixel of a tile."""
-    group, inside = tile // rec.GROUP_TILES, tile % rec.GROUP_TILES
-    side = 1 << rec.GROUP_SHIFT
-    x = (group % group_columns) * side + inside % side
-    y = (group // group_columns) * side + inside // side
-    return x * TILE, y * TILE
-
-
-@parallel
-def blend(
-    tile, tiles, records, entries, offsets, group_columns, size, background, grid, touched, ends, planes, cull_blocks
-):  # fmt: skip
-    """Blend a tile; a pixel depends only on its own one.
-
-    ``size`` is width and height, ``planes`` are image, transmittance and depth. ``cull_blocks`` says
-    whether to skip the blocks that a splat cannot reach.
-    """
-    begin, end = np.int64(offsets[tile]), np.int64(offsets[tile + 1])
-    ends[tile] = blend_tile(
-        records, entries, begin, end, tile_corner(tile, group_columns), size, background, grid, touched, planes,
-        simd.scratch(FORWARD_SCRATCH), cull_blocks,
-    )  # fmt: skip
+    ends[tile] = i
 
 
 @inline
