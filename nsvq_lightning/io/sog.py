@@ -73,12 +73,12 @@ def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
 
     if not 1 <= palette <= PALETTE_LIMIT:
         raise ValueError(f"palette must be in 1..{PALETTE_LIMIT}, got {palette}")
-    low, high, means = _packed_means(scene.means)
+    halves, means = _packed_means(scene.means)
     scales, scale_levels = _leveled(scene.rows("scales"))
     colors, color_levels = _leveled(scene.rows("sh0"))
     texels = {
-        "means_l.webp": low,
-        "means_u.webp": high,
+        "means_l.webp": halves[..., 0],
+        "means_u.webp": halves[..., 1],
         "quats.webp": _packed_quats(scene.rows("quats")),
         "scales.webp": scales,
         "sh0.webp": np.c_[colors, bytes_of(scene.opacities)],
@@ -323,14 +323,14 @@ def _visibility(scene: CompressedScene) -> Float64s:
     return weight / float(weight.mean()) + 0.01
 
 
-def _packed_means(means: Float32s) -> tuple[Uint8s, Uint8s, dict[str, list[float]]]:
-    """Low and high bytes of positions ``[N, 3]``, and what ``meta.json`` says of them."""
+def _packed_means(means: Float32s) -> tuple[Uint8s, dict[str, list[float]]]:
+    """Low and high bytes ``[N, 3, 2]`` of positions, and what ``meta.json`` says of them."""
     wide = means.astype(np.float64)
     logs = np.copysign(np.log1p(np.abs(wide)), wide)
     low, high = logs.min(0), logs.max(0)
     extent = np.where(high > low, high - low, 1)
     halves = _low_and_high(np.rint(65535 * ((logs - low) / extent)))
-    return halves[..., 0], halves[..., 1], {"mins": low.tolist(), "maxs": high.tolist()}
+    return halves, {"mins": low.tolist(), "maxs": high.tolist()}
 
 
 def _low_and_high(numbers: Arrays) -> Uint8s:
