@@ -228,8 +228,7 @@ def _table(rows: Sequence[Measurement]) -> str:
 
 def number(value: float) -> str:
     """Three significant digits, counts in full: ``0.0123``, ``4.1e-07``, ``80,000``."""
-    if value == round(value) and abs(value) < 1e15:
+    size = abs(value)
+    if (value == round(value) and size < 1e15) or 100 <= size < 1e7:
         return f"{value:,.0f}"
-    if abs(value) < 1e-3 or abs(value) >= 1e7:
-        return f"{value:.2g}"
-    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return f"{value:.3g}" if 1e-3 <= size < 1e7 else f"{value:.2g}"
