@@ -21,8 +21,7 @@ def generator(seed: int, step: int = 0, *salts: int | str) -> torch.Generator:
         salts: What the draw is for, for example ``"noise"``, an attribute's name, a rank.
     """
     key = "/".join(str(part) for part in (seed, step, *salts))
-    mixed = int.from_bytes(hashlib.sha256(key.encode()).digest()[:8], "little") >> 1
-    return torch.Generator().manual_seed(mixed)
+    return torch.Generator().manual_seed(int.from_bytes(hashlib.sha256(key.encode()).digest()[:8], "little") >> 1)
 
 
 def draw_rows(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:

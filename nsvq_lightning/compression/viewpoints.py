@@ -141,8 +141,7 @@ MIN_OF_PART = 0.1
 def showing(cameras: Sequence[Camera], means: Float32s, most: int) -> list[Camera]:
     """At most so many cameras that show most of the positions ``[N, 3]``, N > 0; those that show few are no use."""
     shares = seen_by(cameras, means).mean(1) if cameras else np.zeros(0)
-    best = np.argsort(-shares, kind="stable")[:most]
-    return [cameras[index] for index in best if shares[index] >= MIN_OF_PART]
+    return [cameras[index] for index in np.argsort(-shares, kind="stable")[:most] if shares[index] >= MIN_OF_PART]
 
 
 def decibels(error: float) -> float:

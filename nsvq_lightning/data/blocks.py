@@ -244,8 +244,7 @@ def shown(front: _Front, inside: Bools, camera: Camera) -> Bools:
     # A cell without points shows what the nearest one with points does.
     nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
     grid = cv2.dilate(here[tuple(nearest)], None)  # by its neighbours, 3 x 3
-    pixels = grid.repeat(size, axis=0).repeat(size, axis=1)
-    return np.asarray(pixels[: camera.height, : camera.width], bool)
+    return np.asarray(grid.repeat(size, axis=0).repeat(size, axis=1)[: camera.height, : camera.width], bool)
 
 
 def _write_photo(folder: Path, index: int, image: Uint8s, mask: Bools, camera: Camera) -> Json:

@@ -207,8 +207,7 @@ def _followed(a: _Photo, b: _Photo, there: Float32s, back: Float32s, stride: int
         good &= cv2.remap(b.counts.view(np.uint8), ends, None, cv2.INTER_NEAREST) > 0
     rows, columns = (stride * found for found in np.nonzero(good[::stride, ::stride]))
     start = starts[rows, columns].astype(np.float64) + 0.5
-    end = ends[rows, columns].astype(np.float64) + 0.5
-    return _triangulated(a, b, start, end)
+    return _triangulated(a, b, start, ends[rows, columns].astype(np.float64) + 0.5)
 
 
 def _matched(a: _Photo, b: _Photo) -> _Points:

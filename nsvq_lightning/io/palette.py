@@ -160,8 +160,7 @@ def scalar_kmeans(values: Float32s, weight: Integers | int = 1, count: int = 256
         count: Number of levels; the last one is repeated if fewer are enough.
     """
     distinct, inverse = np.unique_inverse(values)
-    weights = np.broadcast_to(weight, values.shape).ravel()
-    mass = np.bincount(inverse.ravel(), weights)
+    mass = np.bincount(inverse.ravel(), np.broadcast_to(weight, values.shape).ravel())
     numbers = distinct[mass > 0].astype(np.float64)
     mass = mass[mass > 0]
     if len(numbers) <= count:

@@ -76,8 +76,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     harmonics = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
 
     def turned_harmonics(rows: Float32s) -> Arrays:
-        coefficients = rows.reshape(len(rows), len(harmonics), 3)
-        return (harmonics @ coefficients).reshape(rows.shape)
+        return (harmonics @ rows.reshape(len(rows), len(harmonics), 3)).reshape(rows.shape)
 
     means, origin = scene.means @ linear.T, linear @ scene.origin
     if any(scene.origin) or np.linalg.norm(shift) > FAR * middle_of(means)[1] > 0:

@@ -329,8 +329,7 @@ def _packed_means(means: Float32s) -> tuple[Uint8s, dict[str, list[float]]]:
     logs = np.copysign(np.log1p(np.abs(wide)), wide)
     low, high = logs.min(0), logs.max(0)
     extent = np.where(high > low, high - low, 1)
-    halves = _low_and_high(np.rint(65535 * ((logs - low) / extent)))
-    return halves, {"mins": low.tolist(), "maxs": high.tolist()}
+    return _low_and_high(np.rint(65535 * ((logs - low) / extent))), {"mins": low.tolist(), "maxs": high.tolist()}
 
 
 def _low_and_high(numbers: Arrays) -> Uint8s:

@@ -57,8 +57,7 @@ def _records(scene: CompressedScene, clamped: Clamped) -> NDArray[np.void]:
     held = scales.clip(-87.0, 88.0)
     clamped["scales"] += (held != scales).any(1).sum()
     records["lengths"] = np.exp(held)
-    colors = 255 * (0.5 + SH_C0 * scene.rows("sh0"))
-    records["colors"][:, :3] = clamped.nearest("sh0", colors, (0, 255))
+    records["colors"][:, :3] = clamped.nearest("sh0", 255 * (0.5 + SH_C0 * scene.rows("sh0")), (0, 255))
     records["colors"][:, 3] = bytes_of(scene.opacities)
     units = unit(scene.rows("quats"))
     # Of q and -q, the one whose largest component is negative: -1 fits a byte, 1 does not.

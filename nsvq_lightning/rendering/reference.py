@@ -137,8 +137,7 @@ def render(splats: RawSplats, camera: Camera, shading: Shading) -> Layers:
 
     direction = shown.means - camera.to(shown.means.device, shown.means.dtype).position
     direction = direction / direction.square().sum(-1, keepdim=True).clamp_min(1e-20).sqrt()
-    colors = sh_colors(direction, shown.sh0, shown.shN, sh_degree)
-    features = torch.cat([colors, projection.depths[:, None]], -1)
+    features = torch.cat([sh_colors(direction, shown.sh0, shown.shN, sh_degree), projection.depths[:, None]], -1)
     centres = means2d[rows]
 
     order = torch.sort(projection.depths.detach(), stable=True).indices

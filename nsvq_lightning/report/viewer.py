@@ -111,8 +111,7 @@ def best_view(splats: SplatTensors, cameras: Sequence[Camera]) -> int:
         column, row, depth = projected(means, camera.to("cpu"))
         across = 1 - np.abs(2 * column / camera.width - 1)
         down = 1 - np.abs(2 * row / camera.height - 1)
-        centrality = across.clip(0) * down.clip(0)
-        return float((weights * centrality)[depth > camera.near].sum())
+        return float((weights * (across.clip(0) * down.clip(0)))[depth > camera.near].sum())
 
     return max(range(len(cameras)), key=lambda place: shown(cameras[place]))
 

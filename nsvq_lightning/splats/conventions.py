@@ -104,6 +104,5 @@ def from_smallest_three(largest: NDArray[np.intp], others: Float64s) -> Float32s
     """Unit quaternions ``[N, 4]`` from the two results of :func:`smallest_three`; the second may be rounded."""
     quats = np.empty((len(largest), 4))
     np.put_along_axis(quats, _OTHERS[largest], others, 1)
-    rest = np.sqrt(np.maximum(0, 1 - np.square(others).sum(1)))
-    np.put_along_axis(quats, largest[:, None], rest[:, None], 1)
+    np.put_along_axis(quats, largest[:, None], np.sqrt(np.maximum(0, 1 - np.square(others).sum(1)))[:, None], 1)
     return quats.astype(np.float32)

@@ -81,8 +81,7 @@ def sensitivity(
     raw = RawSplats(*(tensor.requires_grad_() for tensor in detached(splats)))
     with torch.enable_grad():
         image = render(raw, camera).image
-    drawn = apply_mask(_drawn(signs, image), mask)
-    gradients = torch.autograd.grad(image, raw, drawn, materialize_grads=True)
+    gradients = torch.autograd.grad(image, raw, apply_mask(_drawn(signs, image), mask), materialize_grads=True)
     return RawSplats(*(gradient.square_() for gradient in gradients)), image.detach()
 
 
