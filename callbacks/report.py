@@ -34,14 +34,15 @@ log = logging.getLogger(__name__)
 
 
 def notify_monitors(trainer: Trainer, module: SplatModule) -> None:
-    """Let early stopping and checkpoints that monitor ``report/…`` act now.
+    """Let early stopping and checkpoints with a monitor act now; those of ``train/…`` once that has been logged.
 
     They wait for the end of an epoch or a validation, depending on their settings and the trainer's, and act in one of
     these hooks. Here the sampler is endless and no validation runs, so neither ever comes.
     """
     watchers: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
     for watcher in watchers:
-        if isinstance(watcher, EarlyStopping | ModelCheckpoint) and (watcher.monitor or "").startswith("report/"):
+        monitor = watcher.monitor if isinstance(watcher, EarlyStopping | ModelCheckpoint) else None
+        if monitor and (monitor in trainer.callback_metrics or not monitor.startswith("train/")):
             watcher.on_train_epoch_end(trainer, module)
             watcher.on_validation_end(trainer, module)
 

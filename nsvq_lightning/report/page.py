@@ -176,8 +176,7 @@ def _jpeg(picture: MatLike) -> str:
     """A picture as an address that holds it."""
     factor = min(1.0, 1000 / max(picture.shape[:2]))
     picture = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1]
-    return data_address("jpeg", encoded.tobytes())
+    return data_address("jpeg", cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes())
 
 
 def _decibels(psnr: float | None) -> str:

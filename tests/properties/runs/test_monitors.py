@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from lightning.pytorch import Callback
+from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from runs import Recipe, RunFactory
@@ -55,6 +55,26 @@ def test_early_stopping_ends_the_run(run: RunFactory, recipe: Recipe, at_epochs:
     assert trainer.global_step == 16
     assert [entry["iteration"] for entry in module.history] == [5, 10, 15, 16]
     assert (run_folder(trainer) / "scene.nsvq").is_file()
+
+
+def test_metrics_of_the_module_are_watched_and_unknown_ones_refused_at_the_first_evaluation(
+    run: RunFactory, recipe: Recipe, tmp_path: Path
+) -> None:
+    stop = EarlyStopping("train/loss", min_delta=100.0, patience=2, verbose=False)
+    best = ModelCheckpoint(tmp_path, "{step}", monitor="train/loss", save_top_k=-1)
+    trainer, _ = run([*recipe(report=MetricReport(every=5)).values(), stop, best], log_every_n_steps=7)
+    # At iteration 5 there is none yet.
+    assert sorted(best.best_k_models) == [str(tmp_path / f"step={step}.ckpt") for step in (10, 15, 20, 21)]
+    assert trainer.global_step == 21
+    seen: list[int] = []
+
+    class Steps(Callback):
+        def on_train_batch_end(self, trainer: Trainer, *_: object) -> None:
+            seen.append(trainer.global_step)
+
+    with pytest.raises(RuntimeError, match="conditioned on metric `val/psnr` which is not available"):
+        run([*recipe(report=MetricReport(every=5)).values(), Steps(), EarlyStopping("val/psnr", verbose=False)])
+    assert max(seen) <= 5
 
 
 def test_tensorboard_gets_the_pictures_of_the_test(
