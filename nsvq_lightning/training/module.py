@@ -267,7 +267,7 @@ class SplatModule(LightningModule):
         distributed.check_strategy(self.trainer.strategy)
         check_threads()
         if not self.extent:
-            self.extent = distributed.on_first_process(self.trainer, partial(run_scene.extent_of, self.trainer))
+            self.extent = run_scene.extent_of(self.trainer)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """One Adam optimiser with a named group for each attribute and codebook; first splats, if there are none."""
@@ -281,7 +281,10 @@ class SplatModule(LightningModule):
                 self.active_sh_degree = degree
             self.splats = distributed.on_first_process(self.trainer, make).to(self.device)
         run_scene.warn_of_others(self.trainer, self.splats.means)
-        return optim.build_adam(optim.param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
+        optimizer = optim.build_adam(optim.param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
+        if self.rates.by_distance:
+            run_scene.move_by_distance(self.trainer, optimizer, self.splats, self.extent)
+        return optimizer
 
     def on_train_start(self) -> None:
         """Set Adam's numbers of this run, not those of a checkpoint; start measuring the training time."""
@@ -363,8 +366,7 @@ class SplatModule(LightningModule):
         """Render one view: ``name`` and ``image [H, W, 3]`` (8-bit values in [0, 1])."""
         if self.evaluation_splats is None:
             raise RuntimeError("evaluation steps run only inside Trainer.validate, test or predict")
-        image = self.scene.render(self.evaluation_splats, batch.camera).image
-        return {"name": batch.name, "image": eight_bit(image)}
+        return {"name": batch.name, "image": eight_bit(self.scene.render(self.evaluation_splats, batch.camera).image)}
 
     def test_step(self, batch: View, batch_idx: int) -> dict[str, Any]:
         """Score one view: ``image [H, W, 3]`` (8-bit values in [0, 1]), ``psnr``, ``ssim``."""

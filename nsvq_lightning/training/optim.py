@@ -22,8 +22,8 @@ class LearningRates:
     """Learning rates of the recipe (docs/recipe.md); ``configs/paper.yaml`` has those of 3D Gaussian splatting.
 
     Attributes:
-        means: Position at the start, times the extent of the scene.
-        means_final: Position at the end of the decay, times the extent.
+        means: Position at the start, times the extent of the scene or, with ``by_distance``, the splat's distance.
+        means_final: Position at the end of the decay, times the same.
         scales: Log-scale.
         quats: Quaternion.
         opacities: Opacity logit.
@@ -32,13 +32,15 @@ class LearningRates:
         codebook_factor: Factor from the rate of an attribute to that of its codebook.
         scale_with_views: For B views in a step, multiply these rates by √B and adapt Adam's other settings
             (:func:`adapt_to_views`); otherwise use the rates for one view.
+        by_distance: Positions move in proportion to a splat's distance from the nearest train camera, so that all move
+            alike in the photos, however far the cameras went.
 
     Raises:
         ValueError: A rate is negative or not finite, or a rate of the position is 0.
     """
 
     means: float = ATTRIBUTES["means"].rate
-    means_final: float = 4e-6
+    means_final: float = 5.6e-6
     scales: float = ATTRIBUTES["scales"].rate
     quats: float = ATTRIBUTES["quats"].rate
     opacities: float = ATTRIBUTES["opacities"].rate
@@ -46,6 +48,7 @@ class LearningRates:
     shN: float = ATTRIBUTES["shN"].rate
     codebook_factor: float = 1.0
     scale_with_views: bool = False
+    by_distance: bool = True
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -2,18 +2,21 @@
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import torch
 from lightning.pytorch import Trainer
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.optim import Optimizer
 
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.dense_start import dense_points, far_points
 from nsvq_lightning.data.scene import ONE_PLACE, Scene, View, check_cameras, spread
 from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.random import generator
+from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors
 from nsvq_lightning.training.distributed import sum_over_processes
@@ -55,8 +58,7 @@ def train_contributions(trainer: Trainer, trained: SplatScene) -> Tensor:
     Raises:
         ValueError: The trainer has no data module with a scene.
     """
-    need = "contributions of splats need the train views"
-    scene = needed_scene(trainer, need, "leave weights by contribution off")
+    scene = needed_scene(trainer, "contributions of splats need the train views", "leave weights by contribution off")
     cameras = scene.train_cameras[trainer.global_rank :: trainer.world_size]
     return sum_over_processes(trainer, contributions(trained.splats, cameras, trained.render))
 
@@ -96,6 +98,36 @@ def extent_of(trainer: Trainer) -> float:
     if scene.extent <= 0.0:
         raise ValueError(f"the {len(scene)} photos of {scene.root} {ONE_PLACE}")
     return EXTENT
+
+
+def camera_distances(cameras: Iterable[Camera], means: Tensor) -> Tensor:
+    """Distance ``[N]`` of positions ``[N, 3]`` from the nearest camera, at least the near plane's; finite."""
+    distances, _ = cKDTree([camera.packed_view[12:] for camera in cameras]).query(means.nan_to_num().cpu())
+    return torch.from_numpy(distances).to(means).clamp_min(NEAR)
+
+
+def move_by_distance(trainer: Trainer, optimizer: Optimizer, splats: Splats, extent: float) -> None:
+    """Multiply the steps of positions by their distance from the nearest train camera over the extent.
+
+    It is the distance that a splat had when it was added. Without a scene, steps are as they are.
+    """
+    scene = scene_of(trainer)
+    if scene is None:
+        return
+    starts: list[Tensor] = []
+    edits = -1
+
+    def scale(*_: object) -> None:
+        nonlocal edits
+        means, distances = splats.means.detach(), splats.add_table("distance")
+        if edits != splats.edits:
+            edits = splats.edits
+            new = distances == 0
+            distances[new] = camera_distances(scene.standard.train_cameras, means[new])
+        torch.lerp(starts.pop(), means, (distances / extent)[:, None], out=means)
+
+    optimizer.register_step_pre_hook(lambda *_: starts.append(splats.means.detach().clone()))
+    optimizer.register_step_post_hook(scale)
 
 
 def splats_of_file(path: str, trained: SplatScene) -> Splats:
@@ -149,8 +181,7 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
     points, colors = (torch.cat(parts) for parts in zip((points, colors), far_points(scene, points), strict=True))
     splats = Splats.from_points(points, colors, sh_degree, FIRST_OPACITY)
     cameras = scene.train_cameras
-    distances, _ = cKDTree([camera.packed_view[12:] for camera in cameras]).query(splats.means.detach())
-    pixel = torch.from_numpy(distances).float() / max(camera.intrinsics[0] for camera in cameras)
+    pixel = camera_distances(cameras, splats.means.detach()) / max(camera.intrinsics[0] for camera in cameras)
     splats.scales.data.clamp_(max=(MAX_PIXELS * pixel).log()[:, None])
     return splats
 

@@ -18,12 +18,20 @@ from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import save
+from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT, Frame
 from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training import run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
-from nsvq_lightning.training.run_scene import background_of, extent_of, first_splats, needed_scene, scene_of
+from nsvq_lightning.training.run_scene import (
+    background_of,
+    camera_distances,
+    extent_of,
+    first_splats,
+    needed_scene,
+    scene_of,
+)
 
 
 def trainer_of(data: ColmapDataModule | None) -> Any:
@@ -102,6 +110,29 @@ def test_a_lone_point_before_the_cameras_does_not_hide_the_scene(make_scene: Cal
     assert float(pixels[0]) == pytest.approx(50.0, rel=1e-4)
     assert torch.equal(capped.scales[1:], free.scales[1:])
     assert capped.opacities.sigmoid().tolist() == pytest.approx([0.3] * 4)
+
+
+def test_positions_move_in_proportion_to_their_distance(demo_scene: Path) -> None:
+    data = ColmapDataModule(str(demo_scene), factor=4)
+    start = Splats.from_tensors(*random_splats(300, sh_degree=1))
+    start.means.data *= torch.linspace(0.2, 3.0, 300)[:, None]
+    steps, nearest = {}, torch.ones(0)
+    for by_distance in (True, False):
+        module = SplatModule(codebooks=None, splats=start, rates=LearningRates(by_distance=by_distance))
+        fit(module, data, [PhaseSchedule()], 1)
+        before = module.frame.splats(start).means
+        centres = torch.tensor([camera.packed_view[12:] for camera in data.scene.standard.train_cameras])
+        nearest = torch.cdist(before.double(), centres.double()).min(1).values.float()
+        steps[by_distance] = module.splats.means.detach() - before
+    assert (steps[False] != 0).any(1).sum() > 100
+    assert nearest.max() > 4 * nearest.min()
+    torch.testing.assert_close(steps[True], steps[False] * nearest[:, None] / 5, atol=2e-6, rtol=1e-3)
+    camera = data.scene.train_cameras[0]
+    at = torch.tensor(camera.packed_view[12:]).float()
+    places = torch.stack([at, at + torch.tensor([0.0, 3.0, 4.0]), torch.full((3,), torch.nan)])
+    distances = camera_distances([camera], places)  # of a splat that is not finite, too, until it is dropped
+    assert distances[:2].tolist() == pytest.approx([NEAR, 5.0], rel=1e-5)
+    assert distances.isfinite().all()
 
 
 def test_photos_from_one_place_are_named(make_scene: Callable[..., Path]) -> None:
