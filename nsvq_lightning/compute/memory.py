@@ -66,14 +66,20 @@ def flat_checked(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: np.dt
     return array.ravel()
 
 
-def check_inside(name: str, numbers: Array, count: int) -> None:
+def check_inside(name: str, numbers: Array | Tensor, count: int, least: int = 0) -> None:
     """Refuse numbers that are not rows of a table of ``count`` rows.
+
+    Args:
+        name: What the error calls them.
+        numbers: Numbers ``[N, ...]``.
+        count: Number of rows.
+        least: -1 where that stands for no row.
 
     Raises:
         ValueError: One is not.
     """
-    if numbers.size and (numbers.min() < 0 or numbers.max() >= count):
-        raise ValueError(f"{name} must be in [0, {count}), got {numbers.min()} to {numbers.max()}")
+    if len(numbers) and (numbers.min() < least or numbers.max() >= count):
+        raise ValueError(f"{name} must be in [{least}, {count}), got {numbers.min()} to {numbers.max()}")
 
 
 class Workspace:

@@ -7,6 +7,7 @@ from typing import Any, Literal, Protocol, cast
 import torch
 from torch import Tensor, nn
 
+from nsvq_lightning.compute.memory import check_inside
 from nsvq_lightning.quantize.kmeans import draw_far_rows, kmeans, lookup, mean_by_code, shuffled
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.tracking import NearestTracker
@@ -288,9 +289,7 @@ class CodebookQuantizer(nn.Module, ABC):
             raise TypeError(f"codes must be int64, got {codes.dtype}")
         if codes.dim() != 1 or codes.numel() == 0:
             raise ValueError(f"codes must have shape [N] with N > 0, got {list(codes.shape)}")
-        low, high = int(codes.min()), int(codes.max())
-        if low < 0 or high >= self.num_codes:
-            raise ValueError(f"codes must be in [0, {self.num_codes}), got {low} to {high}")
+        check_inside("codes", codes, self.num_codes)
 
     def _search(self, x: Tensor, rows: Tensor | None) -> Tensor:
         """Nearest codes ``[V]`` of the rows ``rows [V]`` of ``x [N, D]``."""

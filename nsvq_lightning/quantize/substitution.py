@@ -289,8 +289,8 @@ def check_inputs(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, **cho
 
 def _check_inside(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> None:
     """Name the row or the code that a kernel has found out of range."""
-    check_inside("rows", rows.numpy(), len(x))
-    check_inside("codes", codes.numpy(), len(codebook))
+    check_inside("rows", rows, len(x))
+    check_inside("codes", codes, len(codebook))
 
 
 def substitute_backward(

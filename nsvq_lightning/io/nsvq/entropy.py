@@ -70,8 +70,7 @@ def _path_contexts(bits: int, neighbours: Int32s, two: bool) -> Uint32s:
     if not 0 <= bits <= 32:
         raise ValueError(f"a path must have 0 to 32 bits, got {bits}")
     check_array("neighbours", neighbours, (len(neighbours), 2), INT32)
-    if neighbours.size and (neighbours.min() < -1 or neighbours.max() >= len(neighbours)):
-        raise ValueError(f"neighbours must be in [-1, {len(neighbours)}), got {neighbours.min()} to {neighbours.max()}")
+    check_inside("neighbours", neighbours, len(neighbours), -1)
     return rc.new_contexts((_RELATIONS + two) << min(bits, _MODELLED_BITS), rc.TWO_START * two)
 
 
