@@ -15,26 +15,32 @@ AHEAD = 16
 
 
 @inline
-def _count_digits(part, parts, count, source, low, shift, histogram):
+def _visit_digits(part, parts, count, source, low, shift, histogram, from_ids, target, to_ids):
+    """Count the keys of every digit; or move them, and what belongs to them, to where their digits belong."""
     row = histogram[part]
-    row[:] = 0
-    first, end = share(count, part, parts)
-    for i in range(first, end):
-        row[((np.int64(get(source, i)) - low) >> shift) & (DIGITS - 1)] += 1
-
-
-@inline
-def _move(part, parts, count, source, from_ids, target, to_ids, low, shift, histogram):
-    """Move keys and what belongs to them to where their digits belong."""
-    row = histogram[part]
+    if target is None:
+        row[:] = 0
     first, end = share(count, part, parts)
     for i in range(first, end):
         key = get(source, i)
         digit = ((np.int64(key) - low) >> shift) & (DIGITS - 1)
         place = row[digit]
         row[digit] = place + 1
-        put(target, place, key)
-        put(to_ids, place, get(from_ids, i))
+        if target is not None:
+            put(target, place, key)
+            put(to_ids, place, get(from_ids, i))
+
+
+@inline
+def _starts(histogram):
+    """Turn counts ``[parts, kinds]`` into where each begins: kind after kind, part after part; returns their sum."""
+    total = 0
+    for kind in range(histogram.shape[1]):
+        for part in range(histogram.shape[0]):
+            here = histogram[part, kind]
+            histogram[part, kind] = total
+            total += here
+    return total
 
 
 @kernel
@@ -51,14 +57,9 @@ def sort_by_depth(parts, count, keys, ids, keys2, ids2, histogram):
     while (high - low) >> shift != 0:
         source, target = (keys2, keys) if swapped else (keys, keys2)
         from_ids, to_ids = (ids2, ids) if swapped else (ids, ids2)
-        in_parallel(_count_digits, parts, (count, source, low, shift, histogram))
-        total = 0
-        for digit in range(DIGITS):
-            for part in range(parts):
-                here = histogram[part, digit]
-                histogram[part, digit] = total
-                total += here
-        in_parallel(_move, parts, (count, source, from_ids, target, to_ids, low, shift, histogram))
+        in_parallel(_visit_digits, parts, (count, source, low, shift, histogram, None, None, None))
+        _starts(histogram)
+        in_parallel(_visit_digits, parts, (count, source, low, shift, histogram, from_ids, target, to_ids))
         swapped = not swapped
         shift += DIGIT_BITS
     return swapped
@@ -107,15 +108,10 @@ def count_tiles(parts, count, order, boxes, group_columns, histogram, offsets):
     first entry in every tile.
     """
     in_parallel(_visit_tiles, parts, (count, order, boxes, group_columns, histogram, None, None))
-    tiles = offsets.shape[0] - 1
-    total = 0
-    for tile in range(tiles):
-        offsets[tile] = total
-        for part in range(parts):
-            here = histogram[part, tile]
-            histogram[part, tile] = total
-            total += here
-    offsets[tiles] = total
+    total = _starts(histogram)
+    for tile in range(histogram.shape[1]):
+        offsets[tile] = histogram[0, tile]
+    offsets[-1] = total
     return total
 
 
