@@ -5,7 +5,6 @@ Sums of rows by code, also the gradient of a codebook, have the same bits on any
 
 from typing import Any, cast
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -15,6 +14,7 @@ from nsvq_lightning.compute.jit import parallel, thread_count
 from nsvq_lightning.compute.memory import INT64, flat_checked
 from nsvq_lightning.compute.rows import put_rows, share
 from nsvq_lightning.quantize.nearest import nearest
+from nsvq_lightning.splats.splats import distinct_rows
 
 
 @parallel
@@ -156,14 +156,6 @@ def mean_by_code(x: Tensor, codes: Tensor, codebook: Tensor, weight: Tensor | No
         mass = sum_by_code(weight[:, None], codes, k)[:, 0]
     means = sums / mass.clamp_min(torch.finfo(torch.float64).tiny)[:, None]
     return torch.where(mass[:, None] > 0, means.to(codebook.dtype), codebook)
-
-
-def distinct_rows(x: Tensor) -> Tensor:
-    """Indices ``[M]`` int64, ascending, of the first occurrence of every distinct row of ``x [N, D]``."""
-    rows = (x + 0.0).contiguous().numpy(force=True)  # + 0.0 turns -0 into 0
-    # As bytes: NumPy would compare the rows of a table number by number, ten times as slowly.
-    _, first = np.unique(rows.view(f"V{rows.itemsize * rows.shape[1]}"), return_index=True)
-    return torch.from_numpy(np.sort(first)).to(x.device)
 
 
 def draw_far_rows(rows: Tensor, codebook: Tensor, count: int, generator: torch.Generator) -> Tensor:
