@@ -6,13 +6,13 @@ the optimiser. The step count of Adam belongs to the parameter, not to a row, an
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from nsvq_lightning.splats.attributes import dropped, finite_rows, listed
+from nsvq_lightning.splats.attributes import ATTRIBUTES, dropped, finite_rows, listed
 from nsvq_lightning.splats.splats import RawSplats, Splats, check_shapes, times_vectors
 from nsvq_lightning.training.optim import find_group
 
@@ -41,14 +41,8 @@ def append_rows(splats: Splats, optimizer: Optimizer, new: RawSplats) -> None:
     count = len(new.means)
     if count == 0:
         return
-
-    def extend_with_zeros(moment: Tensor) -> Tensor:
-        return torch.cat([moment, moment.new_zeros(count, *moment.shape[1:])])
-
-    for name, parameter in splats.attributes().items():
-        values = torch.cat([parameter.detach(), getattr(new, name).to(parameter)])
-        _rebind(splats, optimizer, name, values, extend_with_zeros)
-    _edit_tables(splats, extend_with_zeros)
+    values = (torch.cat([old, more.to(old)]) for old, more in zip(_one_by_one(splats), new, strict=True))
+    _rebind(splats, optimizer, values, lambda rows: torch.cat([rows, rows.new_zeros(count, *rows.shape[1:])]))
 
 
 def keep_rows(splats: Splats, optimizer: Optimizer, mask: Tensor) -> None:
@@ -60,15 +54,9 @@ def keep_rows(splats: Splats, optimizer: Optimizer, mask: Tensor) -> None:
     if mask.dtype != torch.bool or mask.shape != (len(splats),):
         raise ValueError(f"mask must be [{len(splats)}] bool, got {list(mask.shape)} {mask.dtype}")
     rows = mask.nonzero()[:, 0]
-    if len(rows) == len(splats):
-        return
-
-    def select(tensor: Tensor) -> Tensor:
-        return tensor.index_select(0, rows)
-
-    for name, parameter in splats.attributes().items():
-        _rebind(splats, optimizer, name, select(parameter.detach()), select)
-    _edit_tables(splats, select)
+    if len(rows) < len(splats):
+        values = (numbers[rows] for numbers in _one_by_one(splats))
+        _rebind(splats, optimizer, values, lambda numbers: numbers[rows])
 
 
 def replace_attribute(splats: Splats, name: str, values: Tensor) -> None:
@@ -151,21 +139,23 @@ def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> Tensor:
     return kept
 
 
-def _rebind(splats: Splats, optimizer: Optimizer, name: str, values: Tensor, edit: Callable[[Tensor], Tensor]) -> None:
-    """Bind ``values`` as the new parameter ``name`` everywhere the old one was referenced."""
-    group = find_group(optimizer, name)
-    old = group["params"][0]
-    new = nn.Parameter(values, requires_grad=old.requires_grad)
-    moments = _moments(optimizer, name)
-    state = optimizer.state.pop(old, None)
-    if state is not None:
-        optimizer.state[new] = state | {key: edit(moment) for key, moment in moments.items()}
-    group["params"][0] = new
-    setattr(splats, name, new)
+def _one_by_one(splats: Splats) -> Iterator[Tensor]:
+    """The attributes, each when it is asked for, so that those that have been replaced until then take no memory."""
+    return (getattr(splats, name).detach() for name in ATTRIBUTES)
 
 
-def _edit_tables(splats: Splats, edit: Callable[[Tensor], Tensor]) -> None:
-    """Edit the rows of the side tables, the last step of an edit, and count the edit."""
+def _rebind(splats: Splats, optimizer: Optimizer, values: Iterable[Tensor], edit: Callable[[Tensor], Tensor]) -> None:
+    """Bind ``values`` as the new parameters everywhere the old ones were referenced; edit all else that has rows."""
+    for name, rows in zip(ATTRIBUTES, values, strict=True):
+        group = find_group(optimizer, name)
+        old = group["params"][0]
+        new = nn.Parameter(rows, requires_grad=old.requires_grad)
+        moments = _moments(optimizer, name)
+        state = optimizer.state.pop(old, None)
+        if state is not None:
+            optimizer.state[new] = state | {key: edit(moment) for key, moment in moments.items()}
+        group["params"][0] = new
+        setattr(splats, name, new)
     splats.edits += 1
     for name, table in splats.tables().items():
         setattr(splats, name, edit(table))
