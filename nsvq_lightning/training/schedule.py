@@ -112,9 +112,8 @@ class Schedule:
                 f"fine-tuning needs a quantize phase of at least one iteration to place its codebooks in, got "
                 f"prune_end = quantize_end = {self.prune_end}; raise quantize_end or set it to reference_total"
             )
-        if self.position_decay < 1:
-            raise ValueError(f"position_decay must be at least 1, got {self.position_decay}")
-        for name in ("min_density_interval", "min_reset_interval", "min_replacement_interval", "min_finetune"):
+        intervals = "min_density_interval", "min_reset_interval", "min_replacement_interval", "min_finetune"
+        for name in ("position_decay", *intervals):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1 iteration, got {getattr(self, name)}")
         if self.saved < 0 or (self.saved and self.ends[0] < 1):
