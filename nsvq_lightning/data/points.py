@@ -11,7 +11,7 @@ from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.ply import read_ply_columns, read_ply_header
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.poses import looked_at, poses
+from nsvq_lightning.rendering.poses import looked_at, poses, transformed
 from nsvq_lightning.splats.conventions import SH_C0, Bools, Float64s, Uint8s
 
 
@@ -114,7 +114,7 @@ def projected(points: Float64s, camera: Camera) -> tuple[Float64s, Float64s, Flo
     """Column and row in a camera's picture, pixels, and depth ``[P]`` of points ``[P, 3]``; NaN of those behind it."""
     view = camera.viewmat.double().numpy()
     fx, fy, cx, cy = camera.intrinsics
-    x, y, z = (points @ view[:3, :3].T + view[:3, 3]).T
+    x, y, z = transformed(points, view).T
     depth = np.where(z > 0, z, np.nan)
     with np.errstate(invalid="ignore"):
         return fx * x / depth + cx, fy * y / depth + cy, depth

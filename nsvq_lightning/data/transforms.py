@@ -21,7 +21,7 @@ from nsvq_lightning.data.photo_files import locate
 from nsvq_lightning.data.points import cloud_in, read_points, share_seen
 from nsvq_lightning.io.errors import Json
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.poses import viewmat_of
+from nsvq_lightning.rendering.poses import transformed, viewmat_of
 from nsvq_lightning.splats.conventions import Float64s, Uint8s
 
 log = logging.getLogger(__name__)
@@ -92,7 +92,7 @@ def _with_colmap_points(poses: ColmapModel, root: Path) -> ColmapModel:
         log.warning("the points of %s are not used: %s", root / models[0], error)
         return poses
     log.info("%s names no points: those of %s are used", root / poses.source, root / models[0])
-    return replace(poses, points=found.points @ moved[:3, :3].T + moved[:3, 3], colors=found.colors)
+    return replace(poses, points=transformed(found.points, moved), colors=found.colors)
 
 
 def _numbers(values: object) -> Float64s:
@@ -357,7 +357,7 @@ def _points(
         lens = cameras[image.camera_id]
         view = torch.from_numpy(image.viewmat)
         views.append(Camera(lens.calibration_matrix(), view, lens.width, lens.height))
-    moved = points @ applied[:3, :3].T + applied[:3, 3]
+    moved = transformed(points, applied)
     if share_seen(moved, views) > 1.5 * share_seen(points, views):
         log.info("%s: the points are not in the frame of the cameras: applied_transform moves them there", path)
         return moved, colors

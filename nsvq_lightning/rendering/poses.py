@@ -65,6 +65,11 @@ def view_from(rotation: Float64s, position: Float64s) -> Tensor:
     return torch.from_numpy(viewmat_of(rotation.T, position).astype(np.float32))
 
 
+def transformed(points: Float64s, matrix: Float64s) -> Float64s:
+    """Points ``[P, 3]`` after a matrix ``[3, 4]``, a linear map and a translation; a fourth row may follow."""
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
 def viewmat_of(rotation: Float64s, position: Float64s) -> Float64s:
     """World to camera ``[4, 4]``, from the rotation to the camera and the position in the world."""
     view = np.eye(4)
