@@ -1,6 +1,7 @@
 """What a run spends its time on: training, without pauses and the compilation of kernels, and all else."""
 
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -55,14 +56,14 @@ class TimesBeside:
 
     def __init__(self) -> None:
         self._compiled_before = compile_seconds()
-        self._seconds: dict[str, float] = {}
+        self._seconds = defaultdict[str, float](float)
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
         """Add the time of the body to a part."""
         start = time.perf_counter()
         yield
-        self._seconds[part] = self._seconds.get(part, 0.0) + time.perf_counter() - start
+        self._seconds[part] += time.perf_counter() - start
 
     def seconds(self) -> dict[str, float]:
         """Seconds by part, and those in which kernels were compiled."""
