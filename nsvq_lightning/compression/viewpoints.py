@@ -1,7 +1,7 @@
 """A scene's own pictures: from where it shows detail, and how far two pictures are apart."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,9 +44,10 @@ def look_at(target: Float64s, eye: Float64s, width: int, height: int, angle: flo
 
 
 @torch.no_grad()
-def pictures(splats: SplatTensors, cameras: Sequence[Camera], look: Renderer = render) -> list[Tensor]:
+def pictures(splats: SplatTensors, cameras: Sequence[Camera], look: Renderer = render) -> Iterator[Tensor]:
     """What each camera sees, ``[H, W, 3]`` in [0, 1]."""
-    return [look(splats, camera).image.clamp(0, 1) for camera in cameras]
+    for camera in cameras:
+        yield look(splats, camera).image.clamp(0, 1)
 
 
 # Largest number of views in which errors are measured.
@@ -71,7 +72,7 @@ class Measure:
     def __init__(self, original: SplatTensors, cameras: Sequence[Camera], look: Renderer = render) -> None:
         self.cameras = spread(cameras, MEASURED)
         self._look = look
-        self._expected = pictures(original, self.cameras, look)
+        self._expected = list(pictures(original, self.cameras, look))
         if all(torch.equal(picture, picture[:1, :1].expand_as(picture)) for picture in self._expected):
             raise ValueError(
                 f"all {len(self.cameras)} pictures of the scene are empty, so no error can be measured: its splats are "
@@ -80,7 +81,7 @@ class Measure:
 
     def error(self, splats: SplatTensors) -> float:
         """Root mean square difference for channels in [0, 1]."""
-        found = (pictures(splats, [camera], self._look)[0] for camera in self.cameras)
+        found = pictures(splats, self.cameras, self._look)
         squares = [float((a - b).double().square().mean()) for a, b in zip(found, self._expected, strict=True)]
         return math.sqrt(np.mean(squares))
 
