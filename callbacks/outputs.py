@@ -15,7 +15,6 @@ from nsvq_lightning.io.atomic import optional
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import FORMATS, save
 from nsvq_lightning.io.nsvq.file import as_stored
-from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.io.placing import placed
 from nsvq_lightning.rendering.camera_paths import CAMERAS
 from nsvq_lightning.report import pictures, viewer
@@ -147,7 +146,7 @@ class LiveScene(WritingCallback):
             scene = CompressedScene.from_splats(splats, config={"antialiased": module.antialiased, "live": state})
             scene = replace(placed(scene, module.frame), cameras=module.cameras)
             with optional(folder / viewer.LIVE_SCENE) as path:
-                save(scene, path, Storage("paper"))
+                save(scene, path, "paper")
         self._answered, ended = asked, time.monotonic()
         self._next = ended + (ended - began) / SHARE
 

@@ -24,7 +24,7 @@ from nsvq_lightning.commands.arguments import add_root, known_views, trained_sce
 from nsvq_lightning.commands.compress import share_or_number, splats_left, written_error
 from nsvq_lightning.io import formats, lod, placing, spz
 from nsvq_lightning.io.compressed import CompressedScene, on_white, renderer
-from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
+from nsvq_lightning.io.nsvq.precision import LEVELS
 from nsvq_lightning.io.sog import PALETTE_LIMIT
 from nsvq_lightning.splats.conventions import Float64s
 
@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
     scene = _edited(CompressedScene.joined([read(path) for path in options.inputs]), options)
     writer = {"palette": options.palette, "version": options.spz_version, "axes": options.spz_axes}
     given = {name: value for name, value in writer.items() if value is not None}
-    size = formats.save(scene, output, Storage(options.level) if options.level else None, **given)
+    size = formats.save(scene, output, options.level, **given)
     say(f"{output}: {len(scene):,} splats in {size:,} bytes, {size / len(scene):.1f} per splat")
     if options.measure:
         # What reading the files again would say of them is known here.

@@ -93,7 +93,6 @@ def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
     """The scene that is meant, as a ``.nsvq`` file; that of a running fit is yet to come."""
     from nsvq_lightning.io.formats import save
     from nsvq_lightning.io.nsvq.header import read_header
-    from nsvq_lightning.io.nsvq.precision import Storage
 
     file = options.scene / "scene.nsvq" if options.live else scene_file(options.scene)
     # What has no cameras gets those of --data.root.
@@ -102,7 +101,7 @@ def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
         return
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "scene.nsvq"
-        save(trained_scene(file, options.root), made, Storage("paper"))
+        save(trained_scene(file, options.root), made, "paper")
         yield made
 
 

@@ -12,7 +12,7 @@ from nsvq_lightning.commands.benchmark.render import painted
 from nsvq_lightning.commands.benchmark.timing import Measurement, Scope, compare
 from nsvq_lightning.commands.benchmark.workloads import Workload, workloads
 from nsvq_lightning.io.formats import load, save
-from nsvq_lightning.io.nsvq.precision import LEVELS, Storage
+from nsvq_lightning.io.nsvq.precision import LEVELS
 from nsvq_lightning.training.splat_scene import to_compressed
 
 
@@ -28,7 +28,7 @@ def _file_rows(workload: Workload, scope: Scope, folder: Path) -> Iterator[Measu
     # Codebooks of one step of k-means: sizes and times do not depend on how good they are.
     scene = to_compressed(splats, quantize.prepare(splats, scope.codebooks))
     writers = {".ply": partial(save, splats)}
-    writers |= {f".nsvq {level}": partial(save, scene, storage=Storage(level)) for level in LEVELS}
+    writers |= {f".nsvq {level}": partial(save, scene, storage=level) for level in LEVELS}
     look = torch.no_grad()(partial(painted, "auto"))
     truths = {".ply": look(splats, workload), ".nsvq": look(scene.tensors(), workload)}
     writes = {}
