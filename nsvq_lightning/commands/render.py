@@ -95,7 +95,7 @@ def run(options: argparse.Namespace) -> int:
     raw = splats.to(device).raw()
     look = partial(
         render,
-        background=torch.tensor(options.background or scene.background, device=device),
+        background=options.background or scene.background,
         antialiased=scene.antialiased,
         sampling=scene.sampling(),
         backend=options.backend,

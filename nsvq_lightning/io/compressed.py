@@ -369,12 +369,10 @@ def on_white(scene: CompressedScene) -> CompressedScene:
 
 
 def renderer(scene: CompressedScene) -> "Callable[[SplatTensors, Camera], Render]":
-    """:func:`nsvq_lightning.render` with the anti-aliasing and the background of a scene, on the CPU."""
-    import torch
-
+    """:func:`nsvq_lightning.render` with the anti-aliasing and the background of a scene."""
     from nsvq_lightning.rendering.rasterize import render
 
-    return partial(render, background=torch.tensor(scene.background), antialiased=scene.antialiased)
+    return partial(render, background=scene.background, antialiased=scene.antialiased)
 
 
 def _check_floats(name: str, array: Float32s, shape: tuple[int, ...]) -> None:

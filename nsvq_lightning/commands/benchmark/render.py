@@ -44,8 +44,7 @@ def run(scope: Scope) -> Iterator[Measurement]:
 
 def painted(backend: str, splats: RawSplats, workload: Workload, sampling: Sampling | None = None) -> Tensor:
     """Render with a back-end; without that argument, it is a :data:`Painter`."""
-    background = torch.tensor(BACKGROUND).to(splats.means)
-    return render(splats, workload.camera, background=background, backend=backend, sampling=sampling).image
+    return render(splats, workload.camera, background=BACKGROUND, backend=backend, sampling=sampling).image
 
 
 # Splats times pixels that the oracle is given, quick and full: half a minute on one core at most.
