@@ -210,6 +210,17 @@ def get(builder, array, offset):
     return builder.load(builder.gep(array, [offset]))
 
 
+@intrinsic
+def integer(typingctx, array, offset):
+    """``integer(array, offset)``: one element as an int64, in which rows and places are counted."""
+
+    def emit(context, builder, sig, values):
+        address = builder.gep(_opened(context, builder, array, values[0]), [values[1]])
+        return context.cast(builder, builder.load(address), array.dtype, types.int64)
+
+    return types.int64(array, types.int64), emit
+
+
 @_function(types.void, types.Array, types.int64, _ELEMENT)
 def put(builder, array, offset, value):
     """``put(array, offset, value)``: one element, without the sign check of Numba's indexing."""

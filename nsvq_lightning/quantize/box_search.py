@@ -276,7 +276,7 @@ def _search_kernel(dim: int) -> Any:
         for i in range(first, stop):
             row, proven = simd.get(rows, i), False
             if bounded:
-                code = np.int64(simd.get(last_codes, row))
+                code = simd.integer(last_codes, row)
                 simd.put(result, i, code)
                 known = code >= 0 and code < codebook.shape[0] // dim
                 proven = known and _prove(dim, codebook, x, row, code, memory, travelled)

@@ -177,13 +177,13 @@ def _score_tile(dim, blocks, halves, rows, count, kept, state):
 @inline
 def _settle(dim, x, row, codebook, scores, codes, at, kept, limit):
     """Nearest code by true distance among those with a score up to ``limit``."""
-    code = np.int64(simd.get(codes, at))
+    code = simd.integer(codes, at)
     if simd.get(scores, at + 1) > limit:
         return code
     distance = F(np.inf)
     for place in range(at, at + kept):
         if simd.get(scores, place) <= limit:
-            code, distance = closer(dim, x, row, codebook, code, distance, np.int64(simd.get(codes, place)))
+            code, distance = closer(dim, x, row, codebook, code, distance, simd.integer(codes, place))
     return code
 
 

@@ -32,7 +32,7 @@ def _list_squared(dim, x, at, codebook, lists, start, keep):
     """Squared distances to the codes of a list, one per lane; the other lanes hold 0."""
 
     def member(k):
-        return squares(dim, x, at, codebook, np.int64(simd.get(lists, start + k)) * dim, keep)
+        return squares(dim, x, at, codebook, simd.integer(lists, start + k) * dim, keep)
 
     return simd.lane_sums((member(0), member(1), member(2), member(3), member(4), member(5), member(6), member(7)))
 
@@ -40,12 +40,12 @@ def _list_squared(dim, x, at, codebook, lists, start, keep):
 @inline
 def _settle(dim, x, row, codebook, lists, start, near):
     """Nearest code by true distance among the members of a list whose bits are set."""
-    code = np.int64(simd.get(lists, start + simd.lowest_bit(near)))
+    code = simd.integer(lists, start + simd.lowest_bit(near))
     if near & (near - 1) == 0:
         return code
     distance = F(np.inf)
     while near != 0:
-        candidate = np.int64(simd.get(lists, start + simd.lowest_bit(near)))
+        candidate = simd.integer(lists, start + simd.lowest_bit(near))
         near &= near - 1
         code, distance = closer(dim, x, row, codebook, code, distance, candidate)
     return code
@@ -62,7 +62,7 @@ def _check_kernel(dim: int) -> Any:
         unused[LIST:] = np.inf
         for i in range(block * _BLOCK, min(rows.shape[0], (block + 1) * _BLOCK)):
             row = simd.get(rows, i)
-            at, start, code = row * dim, row * LIST, np.int64(simd.get(last, row))
+            at, start, code = row * dim, row * LIST, simd.integer(last, row)
             simd.put(result, i, np.int64(-1))
             if code < 0:
                 continue

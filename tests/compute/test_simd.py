@@ -42,6 +42,17 @@ def test_operators(values: Array) -> None:
     np.testing.assert_allclose(out[6], z - exact, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.int32, np.uint16, np.int64])
+def test_an_element_as_an_integer(kind: type[np.generic]) -> None:
+    numbers = np.array([7, 60_000, 3 if kind is np.uint16 else -3], kind)
+
+    def kernel(a: Array, out: Array) -> None:
+        for k in range(3):
+            out[k] = simd.integer(a, k) // 2
+
+    assert run(kernel, numbers)[:3].tolist() == (numbers.astype(np.int64) // 2).tolist()
+
+
 def test_a_scalar_stands_for_a_vector_of_it(values: Array) -> None:
     third = np.float32(1 / 3)
 

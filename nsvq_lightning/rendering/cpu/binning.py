@@ -4,7 +4,7 @@ import numpy as np
 
 from nsvq_lightning.compute.jit import in_parallel, inline, kernel
 from nsvq_lightning.compute.rows import share
-from nsvq_lightning.compute.simd import get, prefetch, put
+from nsvq_lightning.compute.simd import get, integer, prefetch, put
 from nsvq_lightning.rendering.cpu.records import GROUP_SHIFT, GROUP_TILES
 
 DIGIT_BITS = 11
@@ -82,12 +82,12 @@ def _visit_tiles(part, parts, count, order, boxes, group_columns, histogram, ids
     first, end = share(count, part, parts)
     for i in range(first, end):
         if i + AHEAD < end:
-            coming = np.int64(get(order, i + AHEAD))
+            coming = integer(order, i + AHEAD)
             prefetch(boxes, coming)
             if entries is not None:
                 prefetch(ids, coming)
-        place = np.int64(get(order, i))
-        box = np.int64(get(boxes, place))
+        place = integer(order, i)
+        box = integer(boxes, place)
         x0, y0, columns, rows = box & 0xFFFF, (box >> 16) & 0xFFFF, (box >> 32) & 0xFFFF, box >> 48
         splat_row = None if entries is None else get(ids, place)
         for y in range(y0, y0 + rows):

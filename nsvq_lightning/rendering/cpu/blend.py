@@ -342,11 +342,11 @@ def start_block(block, corner, size, planes, gradients, pixel_weights, wanted, g
 def slot_of(integers, row, group):
     """The slot in which a group sums the gradients of a splat."""
     o = rec.RECORD * row
-    origin, extent = np.int64(simd.get(integers, o + rec.ORIGIN)), np.int64(simd.get(integers, o + rec.EXTENT))
+    origin, extent = simd.integer(integers, o + rec.ORIGIN), simd.integer(integers, o + rec.EXTENT)
     x0, y0 = origin & 0xFFFF, origin >> 16
     first_x, first_y = x0 >> rec.GROUP_SHIFT, y0 >> rec.GROUP_SHIFT
     columns = ((x0 + (extent & 0xFFFF) - 1) >> rec.GROUP_SHIFT) - first_x + 1
-    return np.int64(simd.get(integers, o + rec.SLOT)) + (group[1] - first_y) * columns + group[0] - first_x
+    return simd.integer(integers, o + rec.SLOT) + (group[1] - first_y) * columns + group[0] - first_x
 
 
 @inline
@@ -402,12 +402,12 @@ def tile_backward(records, integers, entries, begin, end, corner, group, wanted,
         if i + AHEAD < end:
             simd.prefetch(records, rec.record_of(entries, i + AHEAD))
         if i + SLOT_AHEAD < end:
-            coming = np.int64(simd.get(entries, i + SLOT_AHEAD))
+            coming = simd.integer(entries, i + SLOT_AHEAD)
             simd.prefetch(sums, rec.RECORD * slot_of(integers, coming, group))
-        blocks = np.int64(simd.get(touched, i))
+        blocks = simd.integer(touched, i)
         if blocks == 0:
             continue
-        row = np.int64(simd.get(entries, i))
+        row = simd.integer(entries, i)
         slot = rec.RECORD * slot_of(integers, row, group)
         here = splat_backward(records, row, blocks, corner, wanted, state)
         simd.store(sums, slot, simd.load(sums, slot) + here)
@@ -448,15 +448,15 @@ def total_slots(part, parts, ids, slots, records, integers, sums, g_means2d, wit
     count = ids.shape[0]
     first, last = share(count, part, parts)
     for i in range(first, last):
-        row = np.int64(simd.get(ids, i))
+        row = simd.integer(ids, i)
         clear_between(ids, i, 2, g_means2d)
         if with_absgrad:
             clear_between(ids, i, 3, absgrad)
         r = rec.RECORD * row
-        slot = np.int64(simd.get(integers, r + rec.SLOT))
+        slot = simd.integer(integers, r + rec.SLOT)
         end = np.int64(slots)
         if i + 1 < count:
-            end = np.int64(simd.get(integers, rec.record_of(ids, i + 1) + rec.SLOT))
+            end = simd.integer(integers, rec.record_of(ids, i + 1) + rec.SLOT)
         o = rec.RECORD * slot
         if end > slot + 1:
             total = simd.load(sums, o)

@@ -1,7 +1,5 @@
 """Colours from spherical harmonics and their backward pass, 16 splats at a time."""
 
-import numpy as np
-
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import inline, parallel
 from nsvq_lightning.compute.rows import clear, vector_share
@@ -23,7 +21,7 @@ def prefetch_sh(array, ids, start, end, stride, used):
     """Prefetch the SH rows of 16 later splats of the list, ``used`` floats of each."""
     if start < end:
         for lane in range(16):
-            row = np.int64(simd.get(ids, start + lane)) * stride
+            row = simd.integer(ids, start + lane) * stride
             for k in range(0, used, 16):
                 simd.prefetch(array, row + k)
 
@@ -45,7 +43,7 @@ def gather_sh(shN, ids, start, stride, count, columns):
                 simd.store(columns, 16 * (first + k), rows[k])
     else:
         for lane in range(16):
-            row = np.int64(simd.get(ids, start + lane)) * stride
+            row = simd.integer(ids, start + lane) * stride
             for k in range(count):
                 simd.put(columns, 16 * k + lane, simd.get(shN, row + k))
 
@@ -128,10 +126,10 @@ def scatter_sh(gradient, columns, ids, start, stride, count):
         for first in (0, 16, SH_ROW - 16):
             rows = simd.transpose(simd.load_vectors(columns, 16 * first))
             for lane in range(16):
-                simd.store(gradient, np.int64(simd.get(ids, start + lane)) * stride + first, rows[lane])
+                simd.store(gradient, simd.integer(ids, start + lane) * stride + first, rows[lane])
     else:
         for lane in range(16):
-            row = np.int64(simd.get(ids, start + lane)) * stride
+            row = simd.integer(ids, start + lane) * stride
             for k in range(count):
                 simd.put(gradient, row + k, simd.get(columns, 16 * k + lane))
             clear(gradient, row + count, row + stride)

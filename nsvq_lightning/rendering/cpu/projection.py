@@ -60,8 +60,8 @@ def project_splats(
             row = start + lane
             o = rec.RECORD * row
             simd.store(records, o, simd.load(scratch, 128 + 16 * lane))
-            x0, y0 = np.int64(simd.get(scratch, lane)), np.int64(simd.get(scratch, 16 + lane))
-            x1, y1 = np.int64(simd.get(scratch, 32 + lane)), np.int64(simd.get(scratch, 48 + lane))
+            x0, y0 = simd.integer(scratch, lane), simd.integer(scratch, 16 + lane)
+            x1, y1 = simd.integer(scratch, 32 + lane), simd.integer(scratch, 48 + lane)
             simd.put(integers, o + rec.SLOT, needed)
             simd.put(integers, o + rec.ORIGIN, x0 | (y0 << 16))
             simd.put(integers, o + rec.EXTENT, (x1 - x0 + 1) | ((y1 - y0 + 1) << 16))
@@ -90,18 +90,18 @@ def join_runs(part, parts, runs, records, integers, listed, means2d, radii):
     unseen = first
     start, slot = counts[:part].sum(), slots[:part].sum()
     for k in range(counts[part]):
-        row = np.int64(simd.get(found, first + k))
+        row = simd.integer(found, first + k)
         clear(means2d, 2 * unseen, 2 * row)
         clear(radii, unseen, row)
         unseen = row + 1
         o = rec.RECORD * row
         simd.put(ids, start + k, row)
-        simd.put(integers, o + rec.SLOT, np.int64(simd.get(integers, o + rec.SLOT)) + slot)
+        simd.put(integers, o + rec.SLOT, simd.integer(integers, o + rec.SLOT) + slot)
         # Depths are positive, so their bits sort as integers.
         simd.put(keys, start + k, simd.get(integers, o + rec.DEPTH))
         simd.put(order, start + k, start + k)
-        extent = np.int64(simd.get(integers, o + rec.EXTENT))
-        simd.put(boxes, start + k, np.int64(simd.get(integers, o + rec.ORIGIN)) | (extent << 32))
+        extent = simd.integer(integers, o + rec.EXTENT)
+        simd.put(boxes, start + k, simd.integer(integers, o + rec.ORIGIN) | (extent << 32))
         simd.put(means2d, 2 * row, simd.get(records, o + rec.X))
         simd.put(means2d, 2 * row + 1, simd.get(records, o + rec.Y))
         simd.put(radii, row, simd.get(integers, o + rec.RADIUS))

@@ -38,9 +38,9 @@ def project_backward(
     work, slot = simd.scratch(32), simd.scratch(16).view(np.int32)
     # Between its first and last visible splat, every part clears the rows that it skips.
     begin, end = vector_share(count, part, parts)
-    row = np.int64(simd.get(ids, begin - 1)) + 1 if begin > 0 else 0
+    row = simd.integer(ids, begin - 1) + 1 if begin > 0 else 0
     for i in range(begin, end):
-        here = np.int64(simd.get(ids, i))
+        here = simd.integer(ids, i)
         if here > row:
             clear_rows(row, here, stride, gradients)
         row = here + 1
@@ -54,7 +54,7 @@ def project_backward(
                 coming = rec.record_of(ids, start + AHEAD + lane)
                 simd.prefetch(sums, rec.record_of(integers, coming + rec.SLOT))
         for lane in range(16):
-            row = np.int64(simd.get(ids, start + lane))
+            row = simd.integer(ids, start + lane)
             simd.put(slot, lane, simd.get(integers, rec.RECORD * row + rec.SLOT))
             simd.put(work, lane, simd.get(g_means2d, 2 * row))
             simd.put(work, 16 + lane, simd.get(g_means2d, 2 * row + 1))

@@ -73,7 +73,7 @@ def get3(array, offset):
 @inline
 def record_of(rows, i):
     """Where the record of the i-th of some rows begins."""
-    return RECORD * np.int64(simd.get(rows, i))
+    return RECORD * simd.integer(rows, i)
 
 
 @inline
