@@ -25,7 +25,6 @@ _MODELLED_BITS = 16
 # What two neighbours say about a decision: each one has left the path before, takes 0 here, or takes 1 here.
 _RELATIONS = 9
 
-_START = uint64(0xFFFFFFFFFFFFFFFF)
 # Integers are below it in size: they and their sums are exact in float64.
 _TOO_LARGE = 1 << 52
 _KEY_MASK = uint64((1 << KEY_BITS) - 1)
@@ -205,8 +204,9 @@ def _check_used(words: Uint32s, used: int, outside: str = "") -> None:
 
 
 @inline
-def _ended(words, used):  # type: ignore[no-untyped-def]
+def _ended(words, state):  # type: ignore[no-untyped-def]
     """Whether more words were read than there are: what follows is worth no time."""
+    _, _, used = state
     return used > len(words) + 1
 
 
@@ -235,7 +235,7 @@ def _contexts_of(first, second, path, left, bits, two):  # type: ignore[no-untyp
 
 @_stream_kernel
 def _write_paths(paths, bits, neighbours, words, contexts):  # type: ignore[no-untyped-def]
-    low, width, used = uint64(0), _START, 0
+    state = rc.START
     plain = max(0, bits - _MODELLED_BITS)
     for i in range(len(paths)):
         first, second = _path_of(paths, neighbours[i, 0]), _path_of(paths, neighbours[i, 1])
@@ -243,28 +243,28 @@ def _write_paths(paths, bits, neighbours, words, contexts):  # type: ignore[no-u
         for left in range(bits - 1, plain - 1, -1):
             bit = (paths[i] >> left) & 1
             context, quick = _contexts_of(first, second, path, left, bits, True)
-            low, width, used = rc.encode_bit(bit, context, quick, contexts, low, width, words, used)
+            state = rc.encode_bit(bit, context, quick, contexts, state, words)
             path = 2 * path + bit
-        low, width, used = rc.encode_plain(paths[i] & ((1 << plain) - 1), plain, low, width, words, used)
-    return rc.encode_end(low, words, used)
+        state = rc.encode_plain(paths[i] & ((1 << plain) - 1), plain, state, words)
+    return rc.encode_end(state, words)
 
 
 @_stream_kernel
 def _read_paths(words, bits, neighbours, paths, contexts, two):  # type: ignore[no-untyped-def]
-    code, width, used = rc.decode_start(words)
+    state = rc.decode_start(words)
     plain = max(0, bits - _MODELLED_BITS)
     for i in range(len(paths)):
         first, second = _path_of(paths, neighbours[i, 0]), _path_of(paths, neighbours[i, 1])
         path = np.int64(0)
         for left in range(bits - 1, plain - 1, -1):
             context, quick = _contexts_of(first, second, path, left, bits, two)
-            bit, code, width, used = rc.decode_bit(context, quick, contexts, code, width, words, used)
+            bit, state = rc.decode_bit(context, quick, contexts, state, words)
             path = 2 * path + bit
-        rest, code, width, used = rc.decode_plain(plain, code, width, words, used)
+        rest, state = rc.decode_plain(plain, state, words)
         paths[i] = (path << plain) + np.int64(rest)
-        if _ended(words, used):
+        if _ended(words, state):
             break
-    return used
+    return state[2]
 
 
 # Lengths of numbers
@@ -292,22 +292,22 @@ def _second_context(start, length):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _write_length(length, start, contexts, low, width, words, used):  # type: ignore[no-untyped-def]
+def _write_length(length, start, contexts, state, words):  # type: ignore[no-untyped-def]
     node = 1
     for left in range(_LENGTH_BITS - 1, -1, -1):
         bit = (length >> left) & 1
-        low, width, used = rc.encode_bit(bit, start + node, start + node, contexts, low, width, words, used)
+        state = rc.encode_bit(bit, start + node, start + node, contexts, state, words)
         node = 2 * node + bit
-    return low, width, used
+    return state
 
 
 @inline
-def _read_length(start, contexts, code, width, words, used):  # type: ignore[no-untyped-def]
+def _read_length(start, contexts, state, words):  # type: ignore[no-untyped-def]
     node = 1
     for _ in range(_LENGTH_BITS):
-        bit, code, width, used = rc.decode_bit(start + node, start + node, contexts, code, width, words, used)
+        bit, state = rc.decode_bit(start + node, start + node, contexts, state, words)
         node = 2 * node + bit
-    return node - (1 << _LENGTH_BITS), code, width, used
+    return node - (1 << _LENGTH_BITS), state
 
 
 # Keys
@@ -321,40 +321,40 @@ def _key_context(depth, before):  # type: ignore[no-untyped-def]
 
 @_stream_kernel
 def _write_keys(keys, depths, words, contexts):  # type: ignore[no-untyped-def]
-    low, width, used = uint64(0), _START, 0
+    state = rc.START
     last, before = uint64(0), 0
     for i in range(len(keys)):
         shift = uint64(KEY_BITS - depths[i])
         step = (keys[i] >> shift) - (last >> shift)
         length = _length(step)
         start = _key_context(depths[i], before)
-        low, width, used = _write_length(length, start, contexts, low, width, words, used)
-        low, width, used = rc.encode_plain(_below(step, length), length - 1, low, width, words, used)
+        state = _write_length(length, start, contexts, state, words)
+        state = rc.encode_plain(_below(step, length), length - 1, state, words)
         last = keys[i]
         before = length + np.int64(shift) if length else 0
-    return rc.encode_end(low, words, used)
+    return rc.encode_end(state, words)
 
 
 @_stream_kernel
 def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
-    code, width, used = rc.decode_start(words)
+    state = rc.decode_start(words)
     last, before = uint64(0), 0
     for i in range(len(keys)):
         shift = uint64(KEY_BITS - depths[i])
         start = _key_context(depths[i], before)
-        length, code, width, used = _read_length(start, contexts, code, width, words, used)
+        length, state = _read_length(start, contexts, state, words)
         if length > depths[i]:
             return _OUTSIDE
-        rest, code, width, used = rc.decode_plain(length - 1, code, width, words, used)
+        rest, state = rc.decode_plain(length - 1, state, words)
         step = (uint64(1) << uint64(length - 1)) | rest if length else uint64(0)
         last = ((last >> shift) + step) << shift  # of two numbers below 2^63: no carry is lost
         if last > _KEY_MASK:
             return _OUTSIDE
         before = length + np.int64(shift) if length else 0
         keys[i] = last
-        if _ended(words, used):
+        if _ended(words, state):
             break
-    return used
+    return state[2]
 
 
 # Integers
@@ -372,7 +372,7 @@ def _expected(values, row, before, column, mode):  # type: ignore[no-untyped-def
 
 @_stream_kernel
 def _write_integers(values, order, modes, words, contexts):  # type: ignore[no-untyped-def]
-    low, width, used = uint64(0), _START, 0
+    state = rc.START
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             before = order[i - 1] if i > 0 else -1
@@ -380,34 +380,34 @@ def _write_integers(values, order, modes, words, contexts):  # type: ignore[no-u
             size = uint64(abs(value))
             length = _length(size)
             start = _INTEGER_CONTEXTS * j
-            low, width, used = _write_length(length, start, contexts, low, width, words, used)
-            low, width, used = rc.encode_plain(value < 0, min(length, 1), low, width, words, used)
+            state = _write_length(length, start, contexts, state, words)
+            state = rc.encode_plain(value < 0, min(length, 1), state, words)
             if length > 1:
                 second = np.int64(size >> uint64(length - 2)) & 1
                 context = _second_context(start, length)
-                low, width, used = rc.encode_bit(second, context, context, contexts, low, width, words, used)
-                low, width, used = rc.encode_plain(_below(size, length - 1), length - 2, low, width, words, used)
-    return rc.encode_end(low, words, used)
+                state = rc.encode_bit(second, context, context, contexts, state, words)
+                state = rc.encode_plain(_below(size, length - 1), length - 2, state, words)
+    return rc.encode_end(state, words)
 
 
 @_stream_kernel
 def _read_integers(words, modes, values, contexts):  # type: ignore[no-untyped-def]
-    code, width, used = rc.decode_start(words)
+    state = rc.decode_start(words)
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             start = _INTEGER_CONTEXTS * j
-            length, code, width, used = _read_length(start, contexts, code, width, words, used)
-            sign, code, width, used = rc.decode_plain(min(length, 1), code, width, words, used)
+            length, state = _read_length(start, contexts, state, words)
+            sign, state = rc.decode_plain(min(length, 1), state, words)
             size = uint64(min(length, 1))
             if length > 1:
                 context = _second_context(start, length)
-                second, code, width, used = rc.decode_bit(context, context, contexts, code, width, words, used)
-                rest, code, width, used = rc.decode_plain(length - 2, code, width, words, used)
+                second, state = rc.decode_bit(context, context, contexts, state, words)
+                rest, state = rc.decode_plain(length - 2, state, words)
                 size = ((uint64(2) | uint64(second)) << uint64(length - 2)) | rest
             value = (-np.int64(size) if sign else np.int64(size)) + _expected(values, i, i - 1, j, modes[j])
             if size >= uint64(2 * _TOO_LARGE) or not -_TOO_LARGE < value < _TOO_LARGE:
                 return _OUTSIDE
             values[i, j] = value
-        if _ended(words, used):
+        if _ended(words, state):
             break
-    return used
+    return state[2]

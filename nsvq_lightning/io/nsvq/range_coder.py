@@ -23,6 +23,8 @@ SLOW_LIMIT, QUICK_LIMIT, TWO_START = 60, 6, 2
 
 _FULL = uint64(0xFFFFFFFFFFFFFFFF)
 _LOW_WORD = uint64(0xFFFFFFFF)
+# The state of a writer before the first bit; that of a reader has a number in the interval in place of its lower end.
+START = uint64(0), _FULL, 0
 # Largest number of bits written at once without a model.
 PLAIN_BITS = 16
 
@@ -81,11 +83,12 @@ def _shift_out(low, width, words, used):
 
 
 @inline
-def encode_bit(bit, context, quick, contexts, low, width, words, used):
-    """Write a bit, of two contexts or of the same one twice; returns the new ``low, width, used``.
+def encode_bit(bit, context, quick, contexts, state, words):
+    """Write a bit, of two contexts or of the same one twice; returns the new state ``low, width, used``.
 
-    Start with ``0, 2⁶⁴ − 1, 0``.
+    Start with :data:`START`.
     """
+    low, width, used = state
     part = (width >> uint64(16)) * _chance(context, quick, contexts)
     one = uint64(0) - uint64(bit)  # all bits set for 1, none for 0
     before = low
@@ -98,8 +101,9 @@ def encode_bit(bit, context, quick, contexts, low, width, words, used):
 
 
 @inline
-def encode_plain(value, bits, low, width, words, used):
-    """Write the lower ``bits`` (0 to 62) of a number, each as likely 0 as 1; returns the new ``low, width, used``."""
+def encode_plain(value, bits, state, words):
+    """Write the lower ``bits`` (0 to 62) of a number, each as likely 0 as 1; returns the new state."""
+    low, width, used = state
     while bits > 0:
         now = min(bits, PLAIN_BITS)
         bits -= now
@@ -113,8 +117,9 @@ def encode_plain(value, bits, low, width, words, used):
 
 
 @inline
-def encode_end(low, words, used):
+def encode_end(state, words):
     """Write the one word that identifies the last interval; returns the number of words."""
+    low, _, used = state
     if low > _FULL - _LOW_WORD:
         _carry(words, used)
         words[used] = 0
@@ -145,21 +150,22 @@ def _shift_in(code, width, words, used):
 
 
 @inline
-def decode_bit(context, quick, contexts, code, width, words, used):
-    """Read a bit; returns it and the new ``code, width, used``."""
+def decode_bit(context, quick, contexts, state, words):
+    """Read a bit; returns it and the new state."""
+    code, width, used = state
     part = (width >> uint64(16)) * _chance(context, quick, contexts)
     bit = np.int64(code < part)
     one = uint64(0) - uint64(bit)
     code -= part & ~one
     width = (part & one) | ((width - part) & ~one)
     _learn_both(bit, context, quick, contexts)
-    code, width, used = _shift_in(code, width, words, used)
-    return bit, code, width, used
+    return bit, _shift_in(code, width, words, used)
 
 
 @inline
-def decode_plain(bits, code, width, words, used):
-    """Read a number of ``bits`` (0 to 62) bits; returns it and the new ``code, width, used``."""
+def decode_plain(bits, state, words):
+    """Read a number of ``bits`` (0 to 62) bits; returns it and the new state."""
+    code, width, used = state
     value = uint64(0)
     while bits > 0:
         now = min(bits, PLAIN_BITS)
@@ -170,4 +176,4 @@ def decode_plain(bits, code, width, words, used):
         code -= digit * width
         value = (value << uint64(now)) | digit
         code, width, used = _shift_in(code, width, words, used)
-    return value, code, width, used
+    return value, (code, width, used)
