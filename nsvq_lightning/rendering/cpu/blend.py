@@ -113,11 +113,12 @@ def waiting(touched, first, count, block):
 
 
 @inline
-def next_splat(low, high, base):
+def next_splat(queue):
     """Take the lowest set bit of a queue of 128; the position is 128 if there is none."""
+    low, high, base = queue
     if low == 0:
         low, high, base = high, np.int64(0), np.int64(64)
-    return base + simd.lowest_bit(low), low & (low - 1), high, base
+    return base + simd.lowest_bit(low), (low & (low - 1), high, base)
 
 
 @inline
@@ -152,14 +153,12 @@ def blend_block(block, count, batch, grid, state, touched, first):
     kept = simd.load(state, T_LEFT + o), load_color(state, o), simd.load(state, Z_SUM + o)
     x, y = pixels_of(grid, block)
     bit = 1 << block
-    low = waiting(touched, first, count, block)
-    high = waiting(touched, first + 64, count - 64, block)
-    base = np.int64(0)
-    while low | high != 0:
-        j0, low, high, base = next_splat(low, high, base)
-        j1, low, high, base = next_splat(low, high, base)
-        j2, low, high, base = next_splat(low, high, base)
-        j3, low, high, base = next_splat(low, high, base)
+    queue = waiting(touched, first, count, block), waiting(touched, first + 64, count - 64, block), np.int64(0)
+    while queue[0] | queue[1] != 0:
+        j0, queue = next_splat(queue)
+        j1, queue = next_splat(queue)
+        j2, queue = next_splat(queue)
+        j3, queue = next_splat(queue)
         r0, r1, r2, r3 = rec.RECORD * j0, rec.RECORD * j1, rec.RECORD * j2, rec.RECORD * j3
         a0, a1 = alpha_at(batch, r0, x, y), alpha_at(batch, r1, x, y)
         a2, a3 = alpha_at(batch, r2, x, y), alpha_at(batch, r3, x, y)
@@ -175,7 +174,7 @@ def blend_block(block, count, batch, grid, state, touched, first):
             for j in range(j3 + 1, count):
                 simd.put(touched, first + j, simd.get(touched, first + j) & ~bit)
             bit = 0
-            low, high = np.int64(0), np.int64(0)
+            queue = np.int64(0), np.int64(0), np.int64(0)
         # The transmittance of closed pixels keeps falling; keep it clear of denormals.
         t = simd.maximum(t4, TINY)
     simd.store(state, T + o, t)
