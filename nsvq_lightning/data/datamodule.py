@@ -118,14 +118,6 @@ class SceneDataModule(LightningDataModule):
         rank_zero_info(_summary(scene))
         return scene
 
-    def prepare_data(self) -> None:
-        """Load the scene if this is the only process, so that an unusable folder fails before a run folder is made.
-
-        Lightning calls this before its loggers create folders; with several processes, only one would fail here.
-        """
-        if self.process == (0, 1):
-            _ = self.scene
-
     def setup(self, stage: str | None = None) -> None:
         """Load the scene; further calls do nothing.
 
@@ -217,6 +209,15 @@ class ColmapDataModule(SceneDataModule):
         settings = factor, max_width, test_every, cache_bytes, images_folder, model, masks, allow_outside
         super().__init__(partial(load_scene, root, *settings), seed, cache_bytes)
         self.root = Path(root).expanduser()
+
+    def prepare_data(self) -> None:
+        """Load the scene if this is the only process, so that an unusable folder fails before a run folder is made.
+
+        Lightning calls this before its loggers create folders; with several processes, only one would fail here. It
+        waits for the other ones where there is such a hook, so the base, which also serves one of several, has none.
+        """
+        if self.process == (0, 1):
+            _ = self.scene
 
 
 class DemoDataModule(ColmapDataModule):

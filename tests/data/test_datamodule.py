@@ -9,13 +9,21 @@ from typing import cast
 
 import pytest
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import LightningDataModule, LightningModule, Trainer
+from lightning.pytorch.utilities.model_helpers import is_overridden
 from runs import quiet_trainer
 from torch import Tensor, nn
 
 from nsvq_lightning.data import datamodule
 from nsvq_lightning.data.colmap import SceneError
-from nsvq_lightning.data.datamodule import DEMO, ColmapDataModule, DemoDataModule, DevicePhotos, view_order
+from nsvq_lightning.data.datamodule import (
+    DEMO,
+    ColmapDataModule,
+    DemoDataModule,
+    DevicePhotos,
+    SceneDataModule,
+    view_order,
+)
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.camera import Camera
 
@@ -122,6 +130,12 @@ def test_setup_is_idempotent_and_prints_the_split_once(
     texts = [record.getMessage() for record in caplog.records if "test views" in record.getMessage()]
     assert len(texts) == 1
     assert "7 train views, 2 test views (every 8th by name: 000.png, 008.png)" in texts[0]
+
+
+def test_one_of_several_processes_can_train_alone_on_a_scene_that_is_there() -> None:
+    # Lightning makes all processes meet where there is such a hook: one that compresses by itself would wait for ever.
+    assert is_overridden("prepare_data", ColmapDataModule("photos"), LightningDataModule)
+    assert not is_overridden("prepare_data", SceneDataModule(ColmapDataModule(str(DEMO)).scene), LightningDataModule)
 
 
 def test_demo_is_read_where_it_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
