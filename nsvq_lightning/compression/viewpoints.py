@@ -12,6 +12,7 @@ from torch.nn.functional import logsigmoid, normalize
 from nsvq_lightning.data.images import ImageStore, Picture
 from nsvq_lightning.data.scene import SOME_SPLATS, Scene, seen_by, spread
 from nsvq_lightning.io.morton import spatial_order
+from nsvq_lightning.quality.formulas import check_photo
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.rendering.camera import Camera, camera_of
 from nsvq_lightning.rendering.constants import NEAR
@@ -109,12 +110,9 @@ def own_scene(
     if photos and [photo.shape for photo in photos] != [(camera.height, camera.width, 3) for camera in cameras]:
         raise ValueError(f"expected a photo [H, W, 3] of its size for each of {len(cameras)} cameras")
     for number, photo in enumerate(photos):
-        if photo.dtype != torch.uint8 and not (photo.is_floating_point() and photo.max() < 2):
-            raise ValueError(f"photo {number} is {photo.dtype} of up to {photo.max():g}, not uint8 or float in [0, 1]")
+        check_photo(f"photo {number}", photo)
     split = "1 in 8" if photos else OWN
-    bytes_ = [
-        (255 * eight_bit(photo.cpu())).round().to(torch.uint8) for photo in photos or pictures(splats, cameras, look)
-    ]
+    seen = [(255 * eight_bit(each.cpu())).round().to(torch.uint8) for each in photos or pictures(splats, cameras, look)]
     centres = poses(cameras)[0]
     frame = Frame.around(centres)
     if not np.ptp(centres, axis=0).any():
@@ -124,7 +122,7 @@ def own_scene(
         root=Path(split),
         names=tuple(f"{number:03d}" for number in range(len(cameras))),
         cameras=tuple(cameras),
-        images=ImageStore((), held=[Picture(photo, None) for photo in bytes_]),
+        images=ImageStore((), held=[Picture(photo, None) for photo in seen]),
         points=splats.means.detach(),
         colors=torch.zeros_like(splats.means),
         train=tuple(index for index in range(len(cameras)) if index % 8 != 4),

@@ -85,23 +85,38 @@ def ssim_window() -> Tensor:
     return taps / taps.sum()
 
 
+def check_photo(name: str, photo: Tensor) -> None:
+    """Refuse a photo of other numbers than uint8, or floats in [0, 1] or a little above, as of a rendering.
+
+    Args:
+        name: What the error calls it.
+        photo: ``[H, W, 3]``.
+
+    Raises:
+        ValueError: It has others.
+    """
+    if photo.dtype != torch.uint8 and not (photo.is_floating_point() and photo.max() < 2):
+        raise ValueError(f"{name} is {photo.dtype} of up to {photo.float().max():g}, not uint8 or float in [0, 1]")
+
+
 def check_pair(image: Tensor, target: Tensor, mask: Tensor | None = None) -> None:
     """Refuse pictures that cannot be compared.
 
     Raises:
-        ValueError: They are not both ``[H, W, 3]``, or the mask is not ``[H, W]``.
+        ValueError: They are not both ``[H, W, 3]``, or the mask is not ``[H, W]`` bool; or :func:`check_photo`.
     """
     if image.shape != target.shape or image.dim() != 3 or image.shape[-1] != 3:
         raise ValueError(f"image and target must both be [H, W, 3], got {list(image.shape)} and {list(target.shape)}")
-    if mask is not None and mask.shape != image.shape[:2]:
-        raise ValueError(f"the mask of images {list(image.shape)} must be [H, W], got {list(mask.shape)}")
+    if mask is not None and (mask.shape, mask.dtype) != (image.shape[:2], torch.bool):
+        raise ValueError(f"masks of {list(image.shape)} must be [H, W], got {list(mask.shape)}, and bool: {mask.dtype}")
+    check_photo("the target", target)
 
 
 def in_range(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Two pictures as floats: the rendered one clamped to [0, 1], the other scaled to [0, 1] if it is uint8."""
+    """Two pictures of one float type: the rendered one clamped to [0, 1], the other scaled to [0, 1] if it is uint8."""
     # Not the gradient of clamp, which at 0 and 1 themselves is 1 before torch 2.14 and 0 from there on.
     inside = torch.where((image < 0) | (image > 1), image.detach().clamp(0.0, 1.0), image)
-    return inside, target.to(image.dtype) / 255 if target.dtype == torch.uint8 else target
+    return inside, target.to(image.dtype) / (255 if target.dtype == torch.uint8 else 1)
 
 
 def plain_ssim(image: Tensor, target: Tensor) -> Tensor:

@@ -82,8 +82,7 @@ def photometric_loss(
         return total * photometric_loss(*masked, scaled / total, psnr=True)
     kernels = _kernels(image, target)
     if kernels is not None:
-        loss: Tensor = _Loss.apply(image, target, dssim_weight, psnr, kernels)  # type: ignore[no-untyped-call]
-        return loss
+        return _Loss.apply(image, target, dssim_weight, psnr, kernels)  # type: ignore[no-any-return, no-untyped-call]
     return plain_loss(image, target, dssim_weight, psnr=psnr)
 
 
