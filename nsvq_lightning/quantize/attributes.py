@@ -37,13 +37,11 @@ def build_quantizers(
             continue
         if sizes[name] < 1:
             raise ValueError(f"codebooks: {name} needs at least 1 code, got {sizes[name]}")
-        built[name] = module = quantizer(sizes[name], dim)
-        codebook = as_quantizer(module).codebook
+        built[name] = made = quantizer(sizes[name], dim)
+        codebook = as_quantizer(made).codebook
         if codebook.dtype != torch.float32 or codebook.shape[1:] != (dim,):
             found = f"{list(codebook.shape)} {codebook.dtype}"
-            raise TypeError(
-                f"{type(module).__name__}: the codebook of {name} must be [K, {dim}] float32, it is {found}"
-            )
+            raise TypeError(f"{type(made).__name__}: the codebook of {name} must be [K, {dim}] float32, it is {found}")
     return built
 
 

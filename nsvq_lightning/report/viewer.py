@@ -125,10 +125,7 @@ def camera_entry(camera: Camera) -> Json:
     """
     right, down, forward, _, position = np.reshape(camera.packed_view, (5, 3))
     pose = [*np.stack([right, -down, -forward, position], axis=1).ravel(), 0.0, 0.0, 0.0, 1.0]
-    return {
-        "camera_to_world": [float(f"{value:.9g}") + 0.0 for value in pose],
-        **lens_entry(camera),
-    }
+    return {"camera_to_world": [float(f"{value:.9g}") + 0.0 for value in pose], **lens_entry(camera)}
 
 
 def lens_entry(camera: Camera) -> dict[str, float]:
