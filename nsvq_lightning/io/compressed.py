@@ -119,14 +119,13 @@ class CompressedScene:
         """
         import torch
 
-        from nsvq_lightning.splats.splats import detached
+        from nsvq_lightning.splats.splats import detached, warn_if_trained
 
         if isinstance(splats, CompressedScene):
             return splats
         if hasattr(splats, "compressed"):
             return splats.compressed()  # type: ignore[no-any-return, operator, union-attr]  # a module
-        if getattr(splats, "edits", 0):
-            log.warning("the splats of a module are in coordinates of training: give the module itself")
+        warn_if_trained(splats)
         named = splats if isinstance(splats, Mapping | torch.nn.ParameterDict) else detached(splats)._asdict()
         rows = {
             key: values.detach().to("cpu", torch.float32, copy=True).numpy()

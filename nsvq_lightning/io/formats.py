@@ -101,7 +101,7 @@ def save(scene: "AnySplats", path: StrPath, storage: Storage | str | None = None
     lost = scene.background if suffix_of(path) == ".glb" else (*scene.background, *scene.origin)
     if any(lost) and not entry.native:
         logger.warning(f"{path}: not stored: origin {scene.origin}, background {scene.background}; set in the viewer")
-    storage = Storage(storage) if isinstance(storage, str) else storage
+    storage = None if storage is None else Storage.of(storage)
     if entry.native:
         options["storage"] = storage
     elif storage is not None:

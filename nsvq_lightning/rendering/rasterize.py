@@ -11,7 +11,7 @@ from nsvq_lightning.compute.devices import resolve_backend
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.sampling import Sampling, Shading, ViewSampling, focal_of
 from nsvq_lightning.splats.attributes import ATTRIBUTES
-from nsvq_lightning.splats.splats import RawSplats, SplatTensors, check_shapes, sh_degree_of
+from nsvq_lightning.splats.splats import RawSplats, SplatTensors, check_shapes, sh_degree_of, warn_if_trained
 
 # Largest relative difference of samplings that only rounding makes.
 ROUNDING = 1e-5
@@ -79,6 +79,7 @@ def render(
             that is not ``[3]``; pixel weights that is not ``[H, W]``; sampling of other splats, or not above 0.
         TypeError: ``splats`` has no such tensors, as a dictionary or a compressed scene.
     """
+    warn_if_trained(splats)
     splats = _checked(splats)
     stored = sh_degree_of(splats.shN)
     degree = stored if sh_degree is None else sh_degree
@@ -151,8 +152,7 @@ def visible(splats: SplatTensors, camera: Camera, *, backend: str = "auto") -> T
         ValueError: As for :func:`render`.
     """
     splats = _checked(splats)
-    rows: Tensor = _module_of(backend, splats.means).visible(splats, camera)
-    return rows
+    return _module_of(backend, splats.means).visible(splats, camera)  # type: ignore[no-any-return]
 
 
 def _module_of(backend: str, like: Tensor) -> Any:

@@ -1,5 +1,6 @@
 """The scene: six raw attributes of N Gaussian splats, and the canonical form of their covariances."""
 
+import logging
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -10,6 +11,8 @@ from torch import Tensor, nn
 
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM, SH_C0, sh_coefficients, shN_degree
+
+log = logging.getLogger(__name__)
 
 
 class RawSplats(NamedTuple):
@@ -194,6 +197,12 @@ class Splats(nn.Module):
 
 # What has the six raw attributes as tensors; :func:`nsvq_lightning.render` takes it.
 SplatTensors = Splats | RawSplats
+
+
+def warn_if_trained(splats: object) -> None:
+    """Warn of the splats of a module after its training, which are not where its cameras and files are."""
+    if getattr(splats, "edits", 0):
+        log.warning("splats of a module are in coordinates of training: give the module itself, or call module(camera)")
 
 
 def detached(splats: SplatTensors) -> RawSplats:

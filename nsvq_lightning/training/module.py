@@ -43,6 +43,9 @@ log = logging.getLogger(__name__)
 # A term of the loss ``[]``, from the rendering of a train view and the view.
 LossTerm = Callable[[Render, View], Tensor]
 
+# What may be behind the splats.
+BACKGROUNDS = "auto", "black", "white", "random"
+
 
 class SplatModule(LightningModule):
     """Trains 3D Gaussian splats and the codebooks that store them (NSVQ-GS).
@@ -123,7 +126,7 @@ class SplatModule(LightningModule):
         splats: SplatTensors | None = None,
     ) -> None:
         super().__init__()
-        if background not in ("auto", "black", "white", "random"):
+        if background not in BACKGROUNDS:
             raise ValueError(f"background must be auto, black, white or random, got {background!r}")
         if not 0.0 <= dssim_weight <= 1.0:
             raise ValueError(f"dssim_weight must be between 0 and 1, got {dssim_weight}")
@@ -139,7 +142,7 @@ class SplatModule(LightningModule):
         self.psnr_loss = psnr_loss
         # A checkpoint stores these two as plain dictionaries.
         self.rates = optim.LearningRates(**rates) if isinstance(rates, Mapping) else rates
-        self.storage = Storage.from_dict(storage) if isinstance(storage, Mapping) else storage
+        self.storage = Storage.of(storage)
         self.backend = backend
         self.antialiased = antialiased
         self.seed = seed = int(seed)
@@ -398,25 +401,33 @@ class SplatModule(LightningModule):
         return super().load_from_checkpoint(checkpoint_path, *args, **settings)
 
     def get_extra_state(self) -> Tensor:
-        """Phase, SH degree, extent, seconds of training, unit, middle and origin of the frame ``[11]``, float64."""
+        """Phase, SH degree, extent, seconds of training; unit, middle and origin of the frame; background and cameras.
+
+        Float64 ``[12 + 4 · C]``.
+        """
         self.stopwatch.lap()
         values = self.phase, self.active_sh_degree, self.extent, self.stopwatch.seconds
-        return torch.tensor([*values, self.frame.unit, *self.frame.middle, *self.frame.origin], dtype=torch.float64)
+        frame = self.frame.unit, *self.frame.middle, *self.frame.origin
+        seen = BACKGROUNDS.index(self.background), *self.cameras.ravel()
+        return torch.tensor([*values, *frame, *seen], dtype=torch.float64)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Go on from these."""
+        """Go on from these; background and cameras of the trainer's scene stay."""
         phase, degree, self.extent, self.stopwatch.seconds, unit, *places = state.tolist()
         self.phase = Phase(int(phase))
         self.splats.edits += 1
         self.active_sh_degree = int(degree)
-        frame = Frame(unit, tuple(places[:3]), tuple(places[3:]))
+        if self.background == "auto":
+            self.background = BACKGROUNDS[int(places[6])]
+        if len(self.cameras) == 0:
+            self.cameras = np.reshape(places[7:], (-1, 4))
+        frame = Frame(unit, tuple(places[:3]), tuple(places[3:6]))
         scene = run_scene.scene_of(self._trainer)  # whose photos may be others, around another middle
         self.frame = frame if scene is None else frame.relative_to(scene.frame.origin)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add history, schedule, quantizers and scene; plain data only, so that ``weights_only=True`` can read it."""
         checkpoint["history"] = self.history
-        checkpoint["cameras"] = self.cameras.tolist()
         checkpoint["schedule"] = asdict(self.schedule)
         checkpoint[resume.QUANTIZER_SETTINGS] = self.quantizer_settings
         scene = run_scene.scene_of(self._trainer)
@@ -441,7 +452,7 @@ class SplatModule(LightningModule):
         self.history = list(checkpoint["history"])
         settings = {"background": self.background, "antialiased": self.antialiased}
         if self._trainer is None or self._trainer.state.fn != "fit":
-            self.cameras = np.reshape(checkpoint.get("cameras", []), (-1, 4))
+            self.cameras = np.reshape(checkpoint.get("cameras", []), (-1, 4))  # of older ones; now in the extra state
             self.schedule = Schedule(**checkpoint["schedule"])
         else:
             self.schedule = resume.continued_schedule(checkpoint, self.schedule)

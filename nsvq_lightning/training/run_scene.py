@@ -32,7 +32,8 @@ FIRST_OPACITY, MAX_PIXELS, MOST_POINTS = 0.3, 50.0, 8
 
 def scene_of(trainer: Trainer | None) -> Scene | None:
     """The scene of the trainer's data module; None if it has none."""
-    return getattr(getattr(trainer, "datamodule", None), "scene", None)
+    scene = getattr(getattr(trainer, "datamodule", None), "scene", None)
+    return scene if isinstance(scene, Scene) else None
 
 
 def needed_scene(trainer: Trainer, need: str, otherwise: str) -> Scene:

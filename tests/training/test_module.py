@@ -15,6 +15,7 @@ from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io import load, save
+from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.quality.loss import photometric_loss
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
@@ -241,9 +242,12 @@ def test_a_module_is_saved_where_its_files_are(
     expected = 2 * module.splats.means.detach() + torch.tensor([1.0, 2.0, 3.0])
     torch.testing.assert_close(load(tmp_path / "scene.ply").means.detach(), expected)
     module.splats.edits = 1  # as once splats have grown
-    save(module.splats, tmp_path / "scene.ply")
-    assert "in coordinates of training: give the module itself" in caplog.text
+    for use in (lambda: save(module.splats, tmp_path / "scene.ply"), lambda: render(module.splats, camera())):
+        caplog.clear()
+        use()
+        assert "in coordinates of training: give the module itself" in caplog.text
     caplog.clear()
+    module(camera())
     other = SplatModule(sh_degree=1, codebooks=CODES, splats=make_splats())
     save(other.splats, tmp_path / "scene.ply")
     assert not caplog.text
@@ -262,6 +266,23 @@ def test_settings_of_a_checkpoint_are_those_of_the_splats_and_plain_numbers(demo
     assert found.splats.sh_degree == module.splats.sh_degree == 1
     assert torch.equal(found.splats.means, module.splats.means)
     assert save(found, tmp_path / "a.nsvq") == save(module, tmp_path / "b.nsvq")
+
+
+def test_a_state_alone_knows_what_is_behind_the_splats_and_from_where_they_were_seen(module: SplatModule) -> None:
+    module.background, module.cameras = "white", np.array([[0.0, 1.0, 2.0, 300.0], [3.0, 4.0, 5.0, 310.0]])
+    other = SplatModule(sh_degree=1, codebooks=CODES)
+    other.load_state_dict(module.state_dict())
+    assert other.background == "white"
+    assert np.array_equal(other.cameras, module.cameras)
+    chosen = SplatModule(sh_degree=1, codebooks=CODES, background="black")
+    chosen.load_state_dict(module.state_dict())
+    assert chosen.background == "black"
+
+
+def test_the_level_of_the_file_is_enough() -> None:
+    assert SplatModule(storage="paper").storage == Storage("paper")  # type: ignore[arg-type]  # as save takes it
+    with pytest.raises(ValueError, match="unknown compression level 'papers'"):
+        SplatModule(storage="papers")  # type: ignore[arg-type]
 
 
 def test_trained_splats_are_rendered_with_all_their_coefficients() -> None:

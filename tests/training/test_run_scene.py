@@ -42,6 +42,7 @@ def test_who_needs_a_scene_says_what_for_and_what_to_do_without(make_scene: Call
     data = ColmapDataModule(str(make_scene()))
     assert scene_of(trainer_of(data)) is data.scene
     assert scene_of(None) is scene_of(trainer_of(None)) is None
+    assert scene_of(trainer_of(SimpleNamespace(scene="bicycle"))) is None  # type: ignore[arg-type]  # of one's own
     assert needed_scene(trainer_of(data), "a test needs photos", "skip it") is data.scene
     with pytest.raises(ValueError, match="a test needs photos: fit with a data module that has a scene, or skip it"):
         needed_scene(trainer_of(None), "a test needs photos", "skip it")

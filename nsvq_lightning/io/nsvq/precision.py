@@ -93,6 +93,8 @@ class Storage:
             return cls()
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> "Storage":
-        """The settings from plain data, as stored in a checkpoint."""
-        return cls(values["level"], Precision(**values["precision"]))
+    def of(cls, given: "Storage | str | Mapping[str, Any]") -> "Storage":
+        """The settings from their level, or from plain data, as stored in a checkpoint; settings stay as they are."""
+        if isinstance(given, Mapping):
+            return cls(given["level"], Precision(**given["precision"]))
+        return cls(given) if isinstance(given, str) else given
