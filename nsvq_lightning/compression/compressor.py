@@ -446,7 +446,7 @@ def compress(
     *,
     target_bytes: int | None = None,
     max_error: float | None = None,
-    codebooks: str = attributes.DEFAULT_SIZE,
+    codebooks: str | None = attributes.DEFAULT_SIZE,
     left: int | None = None,
     antialiased: bool = False,
     background: Literal["black", "white"] = "black",
@@ -462,7 +462,7 @@ def compress(
             fitted to what the cameras see of the scene itself.
         target_bytes: Most bytes of a ``.nsvq`` file.
         max_error: Instead, largest root mean square difference of pictures, for channels in [0, 1].
-        codebooks: Instead, the paper's name of their sizes, or ``"none"``.
+        codebooks: Instead, the paper's name of their sizes; ``"none"`` or None for none.
         left: How many splats are left; None leaves all.
         antialiased: Whether the splats are rendered with anti-aliasing.
         background: What they are shown in front of, in ``photos``, too.
@@ -486,4 +486,4 @@ def compress(
     views = viewpoints.own_scene(scene.tensors(), cameras, photos=shown) if shown else None
     compressor = Compressor(scene, cameras, views, **settings)
     left = len(scene) if left is None else min(left, len(scene))
-    return compressor.best(left, codebooks, target_bytes, max_error).scene
+    return compressor.best(left, codebooks or "none", target_bytes, max_error).scene

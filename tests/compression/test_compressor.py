@@ -219,6 +219,7 @@ def test_a_scene_of_another_program_is_compressed() -> None:
     found = [nl.compress(given, cameras, codebooks="0.5k", steps=4) for given in (scene, splats, gsplat, nerfstudio)]
     assert len({found_.codes["shN"].tobytes() for found_ in found}) == 1
     assert len(found[0].cameras) > 0
+    assert not nl.compress(scene, cameras, codebooks=None, steps=4).codes
     photos = [255 * picture for picture in pictures(splats, cameras)]
     taught = nl.compress(splats, cameras, [photo.to(torch.uint8) for photo in photos], left=200, steps=8)
     assert len(taught) == 200
