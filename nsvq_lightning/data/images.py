@@ -139,9 +139,8 @@ def _decoded(path: Path, flags: int) -> Arrays:
 
 def _to_bytes(pixels: Arrays) -> Uint8s:
     """Pixels of 8 or 16 bits in 8."""
-    if pixels.dtype != np.uint8:
-        pixels = cv2.convertScaleAbs(pixels, alpha=1 / 257)  # rounds; none of the 65536 is near a half
-    return pixels
+    # Rounds; none of the 65536 is near a half.
+    return pixels if pixels.dtype == np.uint8 else cv2.convertScaleAbs(pixels, alpha=1 / 257)
 
 
 def _check_whole(data: bytes) -> None:

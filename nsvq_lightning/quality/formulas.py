@@ -103,13 +103,12 @@ def check_pair(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Non
     """Refuse pictures that cannot be compared.
 
     Raises:
-        ValueError: They are not both ``[H, W, 3]``, or the mask is not ``[H, W]`` bool; or :func:`check_photo`.
+        ValueError: They are not both ``[H, W, 3]``, or the mask is not ``[H, W]`` bool.
     """
     if image.shape != target.shape or image.dim() != 3 or image.shape[-1] != 3:
         raise ValueError(f"image and target must both be [H, W, 3], got {list(image.shape)} and {list(target.shape)}")
     if mask is not None and (mask.shape, mask.dtype) != (image.shape[:2], torch.bool):
         raise ValueError(f"masks of {list(image.shape)} must be [H, W], got {list(mask.shape)}, and bool: {mask.dtype}")
-    check_photo("the target", target)
 
 
 def in_range(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
