@@ -233,8 +233,7 @@ class DensityControl(Densification):
 
     def ask(self, module: SplatModule, iteration: int, batch: View) -> bool:
         """Count the views of the warm-up phase; the gradients are there in any case."""
-        schedule = module.schedule
-        return schedule.phase_at(iteration) is Phase.WARMUP and iteration <= schedule.iteration(self.last)
+        return module.schedule.phase_at(iteration) is Phase.WARMUP and iteration <= module.schedule.iteration(self.last)
 
     def gradients(self, render: Render) -> Tensor | None:
         """The screen-space gradients."""

@@ -110,23 +110,27 @@ class CompressedScene:
 
         Args:
             splats: The splats, or their attributes by their names here or in nerfstudio, tensors or arrays of any
-                numbers, or a checkpoint of gsplat or nerfstudio with these; or a module that was trained, whose
-                :meth:`~nsvq_lightning.SplatModule.compressed` it is; a compressed scene is returned as it is.
+                numbers, or a checkpoint or a model of gsplat or nerfstudio with these; or a module that was trained,
+                whose :meth:`~nsvq_lightning.SplatModule.compressed` it is; a compressed scene is returned as it is.
             header: ``antialiased``, ``metrics`` and ``origin``; or ``config``.
 
         Raises:
             ValueError: The shape of an attribute does not fit the others, or one is missing.
+            TypeError: ``splats`` is nothing of these, as a path.
         """
         import torch
 
-        from nsvq_lightning.splats.splats import detached, warn_if_trained
+        from nsvq_lightning.splats.splats import RawSplats, warn_if_trained
 
         if isinstance(splats, CompressedScene):
             return splats
         if hasattr(splats, "compressed"):
             return splats.compressed()  # type: ignore[no-any-return, operator, union-attr]  # a module
         warn_if_trained(splats)
-        named = splats if isinstance(splats, Mapping | torch.nn.ParameterDict) else detached(splats)._asdict()
+        tensors = splats.state_dict() if isinstance(splats, torch.nn.Module) else splats
+        named: Any = tensors._asdict() if isinstance(tensors, RawSplats) else tensors
+        if not isinstance(named, Mapping):
+            raise TypeError(f"splats must be Splats, or tensors by name, got {type(splats)}; nl.load reads a file")
         rows = {
             key: values.detach().to("cpu", torch.float32, copy=True).numpy()
             if isinstance(values, torch.Tensor)

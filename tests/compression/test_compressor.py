@@ -230,6 +230,8 @@ def test_a_scene_of_another_program_is_compressed() -> None:
             nl.compress(splats, cameras, wrong)
     with pytest.raises(ValueError, match=r"photo 0 is torch\.float32 of up to nan"):
         nl.compress(splats, cameras, [photo * torch.nan for photo in photos])
+    with pytest.raises(TypeError, match=r"splats must be Splats, or tensors by name, got .*; nl\.load reads a file"):
+        nl.compress("scene.ply")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="give target_bytes or max_error, not both"):
         nl.compress(splats, target_bytes=9999, max_error=0.01)
     arrays = nl.compress(splats, cameras, np.stack([photo.numpy() for photo in photos]) / 255, left=200, steps=8)

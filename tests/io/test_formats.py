@@ -45,6 +45,11 @@ def test_attributes_by_name_are_saved_as_they_come(tmp_path: Path) -> None:
     pipeline["_model.step"] = torch.ones(())
     save({"step": 1, "pipeline": pipeline, "optimizers": {}}, tmp_path / "b.ply")  # and those of nerfstudio
     assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
+    model = torch.nn.Module()  # as splatfacto's, which is among others in a model
+    model.gauss_params = torch.nn.ParameterDict(splats.attributes())
+    model.camera_optimizer = torch.nn.Linear(3, 3)
+    save(model, tmp_path / "c.ply")
+    assert all(torch.equal(getattr(load(tmp_path / "c.ply"), name), each) for name, each in splats.attributes().items())
     del named["scales"]
     with pytest.raises(ValueError, match="the splats have no scales"):
         save(named, tmp_path / "a.ply")
