@@ -41,7 +41,7 @@ class Attribute:
 
 # The raw attributes by name, in the order of :meth:`nsvq_lightning.Splats.from_tensors`.
 ATTRIBUTES = {
-    "means": Attribute((3,), "x y z", 9e-4),
+    "means": Attribute((3,), "x y z", 4.5e-4),
     "quats": Attribute((4,), "rot_", 2e-3, 1.0, error=0.005, row_bits=-0.1, code_bits=5.7),
     "scales": Attribute((3,), "scale_", 0.01, 1.0, error=0.02, row_bits=-0.5, code_bits=5.8),
     "opacities": Attribute((), "opacity", 0.025),

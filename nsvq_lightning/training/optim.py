@@ -40,7 +40,7 @@ class LearningRates:
     """
 
     means: float = ATTRIBUTES["means"].rate
-    means_final: float = 1.1e-5
+    means_final: float = 5.6e-6
     scales: float = ATTRIBUTES["scales"].rate
     quats: float = ATTRIBUTES["quats"].rate
     opacities: float = ATTRIBUTES["opacities"].rate
