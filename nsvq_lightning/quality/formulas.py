@@ -85,18 +85,19 @@ def ssim_window() -> Tensor:
     return taps / taps.sum()
 
 
-def check_photo(name: str, photo: Tensor) -> None:
+def check_photo(name: str, rgb: Tensor, *, nan: bool = False) -> None:
     """Refuse a photo of other numbers than uint8, or floats in [0, 1] or a little above, as of a rendering.
 
     Args:
         name: What the error calls it.
-        photo: ``[H, W, 3]``.
+        rgb: Photo ``[H, W, 3]``.
+        nan: Whether some may be NaN.
 
     Raises:
         ValueError: It has others.
     """
-    if photo.dtype != torch.uint8 and not (photo.is_floating_point() and photo.max() < 2):
-        raise ValueError(f"{name} is {photo.dtype} of up to {photo.float().max():g}, not uint8 or float in [0, 1]")
+    if rgb.dtype != torch.uint8 and not (rgb.is_floating_point() and (rgb.max() < 2 or (nan and rgb.isnan().any()))):
+        raise ValueError(f"{name} is {rgb.dtype} of up to {rgb.float().max():g}, not uint8 or float in [0, 1]")
 
 
 def check_pair(image: Tensor, target: Tensor, mask: Tensor | None = None) -> None:

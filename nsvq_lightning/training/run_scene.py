@@ -31,9 +31,9 @@ FIRST_OPACITY, MAX_PIXELS, MOST_POINTS = 0.3, 50.0, 8
 
 
 def scene_of(trainer: Trainer | None) -> Scene | None:
-    """The scene of the trainer's data module; None if it has none."""
+    """The scene of the trainer's data module; None if it has none, or a name of its own."""
     scene = getattr(getattr(trainer, "datamodule", None), "scene", None)
-    return scene if isinstance(scene, Scene) else None
+    return scene if hasattr(scene, "train") else None
 
 
 def needed_scene(trainer: Trainer, need: str, otherwise: str) -> Scene:
