@@ -16,8 +16,7 @@ _PACKAGE = Path(__file__).parent
 
 def folder_of(name: str) -> Path:
     """Where ``callbacks`` or ``configs`` is: in the package, or otherwise next to it."""
-    inside = _PACKAGE / name
-    return inside if inside.is_dir() else _PACKAGE.parent / name
+    return _PACKAGE / name if (_PACKAGE / name).is_dir() else _PACKAGE.parent / name
 
 
 def find_callbacks() -> None:

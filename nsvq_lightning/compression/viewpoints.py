@@ -10,9 +10,8 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid, normalize
 
 from nsvq_lightning.data.images import ImageStore, Picture
-from nsvq_lightning.data.scene import SOME_SPLATS, Scene, seen_by, spread
+from nsvq_lightning.data.scene import SOME_SPLATS, Scene, check_photo, seen_by, spread
 from nsvq_lightning.io.morton import spatial_order
-from nsvq_lightning.quality.formulas import check_photo
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.rendering.camera import Camera, camera_of
 from nsvq_lightning.rendering.constants import NEAR

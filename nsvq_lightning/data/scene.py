@@ -72,6 +72,21 @@ def seen_by(cameras: Sequence[Camera], means: Float32s) -> Bools:
     return np.stack([in_picture(places, camera) for camera in cameras])
 
 
+def check_photo(name: str, rgb: Tensor, *, nan: bool = False) -> None:
+    """Refuse a photo of other numbers than uint8, or floats in [0, 1] or a little above, as of a rendering.
+
+    Args:
+        name: What the error calls it.
+        rgb: Photo ``[H, W, 3]``.
+        nan: Whether some may be NaN.
+
+    Raises:
+        ValueError: It has others.
+    """
+    if rgb.dtype != torch.uint8 and not (rgb.is_floating_point() and (rgb.max() < 2 or (nan and rgb.isnan().any()))):
+        raise ValueError(f"{name} is {rgb.dtype} of up to {rgb.float().max():g}, not uint8 or float in [0, 1]")
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """One photo and its camera.
@@ -81,7 +96,11 @@ class View:
         index: Position among all views of the scene, sorted by name.
         camera: Pinhole camera of the picture.
         image: ``[H, W, 3]`` uint8 RGB, black where it does not count; shared with the scene's cache, so read-only.
+            One's own may be floats in [0, 1]; the loss of what is not finite skips its step.
         mask: Which pixels count ``[H, W]`` bool; None if all do.
+
+    Raises:
+        ValueError: The photo has other numbers.
     """
 
     name: str
@@ -89,6 +108,9 @@ class View:
     camera: Camera
     image: Tensor
     mask: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        check_photo(f"the photo {self.name}", self.image, nan=True)
 
     def to(self, device: torch.device | str, **kwargs: object) -> "View":
         """The view with its photo on another device, or itself if that is there already; Lightning moves batches by it.

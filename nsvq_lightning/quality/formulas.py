@@ -85,21 +85,6 @@ def ssim_window() -> Tensor:
     return taps / taps.sum()
 
 
-def check_photo(name: str, rgb: Tensor, *, nan: bool = False) -> None:
-    """Refuse a photo of other numbers than uint8, or floats in [0, 1] or a little above, as of a rendering.
-
-    Args:
-        name: What the error calls it.
-        rgb: Photo ``[H, W, 3]``.
-        nan: Whether some may be NaN.
-
-    Raises:
-        ValueError: It has others.
-    """
-    if rgb.dtype != torch.uint8 and not (rgb.is_floating_point() and (rgb.max() < 2 or (nan and rgb.isnan().any()))):
-        raise ValueError(f"{name} is {rgb.dtype} of up to {rgb.float().max():g}, not uint8 or float in [0, 1]")
-
-
 def check_pair(image: Tensor, target: Tensor, mask: Tensor | None = None) -> None:
     """Refuse pictures that cannot be compared.
 

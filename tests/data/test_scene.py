@@ -25,8 +25,9 @@ from nsvq_lightning.data.images import ImageHead
 from nsvq_lightning.data.photo_files import photos_below
 from nsvq_lightning.data.points import RANDOM_POINTS
 from nsvq_lightning.data.reconstruct import reconstruct
-from nsvq_lightning.data.scene import is_elsewhere, load_scene, seen_by, spread, usable
+from nsvq_lightning.data.scene import View, is_elsewhere, load_scene, seen_by, spread, usable
 from nsvq_lightning.io.ply import write_elements
+from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.training.module import SplatModule
 
 SceneFactory = Callable[..., Path]
@@ -695,3 +696,12 @@ def test_some_rows_are_spread_over_all() -> None:
     assert spread(range(10), 4) == range(0, 10, 3)
     assert spread((), 4) == ()
     assert spread([1, 2], 4) == [1, 2]
+
+
+@pytest.mark.parametrize("kind", [torch.int64, torch.uint16, torch.float32])
+def test_photos_of_other_numbers_are_refused(kind: torch.dtype) -> None:
+    photo = 255 * torch.rand(8, 8, 3)
+    camera = Camera(torch.eye(3), torch.eye(4), 8, 8)
+    with pytest.raises(ValueError, match=rf"the photo a.png is {kind} of up to 2\d\d.*, not uint8 or float in"):
+        View("a.png", 0, camera, photo.to(kind))
+    assert View("a.png", 0, camera, photo / 255).to("cpu").image.dtype == torch.float32
