@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import torch
 from lightning.pytorch import Trainer
-from torch import Tensor
+from torch import Generator, Tensor
 
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.data.scene import View
@@ -333,7 +333,7 @@ def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, width: 
         total.add_(edges / mean.clamp_min(torch.finfo(edges.dtype).tiny) * seen)
 
 
-def split(parents: RawSplats, shrink: float, generator: torch.Generator) -> RawSplats:
+def split(parents: RawSplats, shrink: float, generator: Generator) -> RawSplats:
     """Two children for each of ``M`` parents ``[2 · M, ...]``: centres drawn from the parent's Gaussian, axes shrunk.
 
     Args:

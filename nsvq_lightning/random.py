@@ -4,13 +4,13 @@ The global generators of torch, NumPy and Python are not used anywhere in this p
 the number of threads, nor on the number of processes, nor on whether a run was interrupted and resumed.
 """
 
-import hashlib
+from hashlib import sha256
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 
-def generator(seed: int, step: int = 0, *salts: int | str) -> torch.Generator:
+def generator(seed: int, step: int = 0, *salts: int | str) -> Generator:
     """A fresh ``torch.Generator`` on the CPU for one draw.
 
     Its own seed is a mix of these in 63 bits (SHA-256: neighbouring inputs give unrelated outputs).
@@ -21,10 +21,10 @@ def generator(seed: int, step: int = 0, *salts: int | str) -> torch.Generator:
         salts: What the draw is for, for example ``"noise"``, an attribute's name, a rank.
     """
     key = "/".join(str(part) for part in (seed, step, *salts))
-    return torch.Generator().manual_seed(int.from_bytes(hashlib.sha256(key.encode()).digest()[:8], "little") >> 1)
+    return Generator().manual_seed(int.from_bytes(sha256(key.encode()).digest()[:8], "little") >> 1)
 
 
-def draw_rows(weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def draw_rows(weight: Tensor, count: int, generator: Generator) -> Tensor:
     """Mask ``[N]`` of ``count`` rows drawn without replacement in proportion to their weight; never one of weight 0.
 
     The ``count`` largest of log weight + Gumbel noise are such a sample (Efraimidis and Spirakis 2006): one draw per

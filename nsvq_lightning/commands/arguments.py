@@ -1,9 +1,9 @@
 """What the arguments of commands stand for: lists, numbers, and scenes with the photos behind them."""
 
-import argparse
 import logging
 import math
 import re
+from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-class Parser(argparse.ArgumentParser):
-    """:class:`argparse.ArgumentParser` that names the option that a misspelt one resembles, and reads ``-1e-9``."""
+class Parser(ArgumentParser):
+    """:class:`ArgumentParser` that names the option that a misspelt one resembles, and reads ``-1e-9``."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -56,13 +56,13 @@ def some_of(known: Iterable[str]) -> Callable[[str], tuple[str, ...]]:
     """A function that reads ``A,B``, of known names, or ``all`` of them.
 
     Raises:
-        argparse.ArgumentTypeError: By the function: an entry is none of them.
+        ArgumentTypeError: By the function: an entry is none of them.
     """
 
     def parse(text: str) -> tuple[str, ...]:
         chosen = tuple(known) if text == "all" else names(text)
         if not set(chosen) <= set(known):
-            raise argparse.ArgumentTypeError(f"choose some of {', '.join(known)}, or all, got {text!r}")
+            raise ArgumentTypeError(f"choose some of {', '.join(known)}, or all, got {text!r}")
         return chosen
 
     return parse
@@ -72,32 +72,32 @@ def integers(text: str) -> tuple[int, ...]:
     """The numbers of ``1,2``, each once.
 
     Raises:
-        argparse.ArgumentTypeError: An entry is not a whole number.
+        ArgumentTypeError: An entry is not a whole number.
     """
     try:
         return tuple(dict.fromkeys(map(int, text.split(","))))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"expected whole numbers with commas between them, got {text!r}") from None
+        raise ArgumentTypeError(f"expected whole numbers with commas between them, got {text!r}") from None
 
 
 def positive(kind: type[int] | type[float]) -> Callable[[str], int | float]:
     """A function that reads a number of this kind.
 
     Raises:
-        argparse.ArgumentTypeError: By the function: it is not above 0, or not finite.
+        ArgumentTypeError: By the function: it is not above 0, or not finite.
     """
 
     def parse(text: str) -> int | float:
         value = kind(text)
         if not 0 < value < math.inf:
-            raise argparse.ArgumentTypeError(f"must be above 0, got {text}")
+            raise ArgumentTypeError(f"must be above 0, got {text}")
         return value
 
     parse.__name__ = kind.__name__  # argparse says "invalid float value"
     return parse
 
 
-def add_root(parser: argparse.ArgumentParser, use: str) -> None:
+def add_root(parser: ArgumentParser, use: str) -> None:
     """Add ``--data.root``, a scene folder.
 
     Args:

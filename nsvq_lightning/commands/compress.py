@@ -10,9 +10,9 @@ Examples:
   nsvq compress scene.ply www/lod-meta.json --levels 4
 """
 
-import argparse
 import re
 import sys
+from argparse import ArgumentError, ArgumentParser, ArgumentTypeError, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,7 +35,7 @@ def share_or_number(text: str) -> int | float:
     """``25%`` as 0.25, ``50000`` as it is, an integer.
 
     Raises:
-        argparse.ArgumentTypeError: It is neither.
+        ArgumentTypeError: It is neither.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)(%?)", text)
     if match:
@@ -44,7 +44,7 @@ def share_or_number(text: str) -> int | float:
             return value / 100
         if not match[2] and value >= 1 and value.is_integer():
             return int(value)
-    raise argparse.ArgumentTypeError(f"expected a number of splats, or a share such as 25%, got {text!r}")
+    raise ArgumentTypeError(f"expected a number of splats, or a share such as 25%, got {text!r}")
 
 
 def splats_left(asked: int | float | None, count: int) -> int:
@@ -62,7 +62,7 @@ def written_error(measure: "Measure", error: float, original: str) -> str:
     return f"error {error:.4g} ({decibels(error):.2f} dB against {original} in {len(measure.cameras)} pictures)"
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add what ``nsvq compress`` takes."""
     add = parser.add_argument
     aim = parser.add_mutually_exclusive_group().add_argument
@@ -84,14 +84,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--minutes", type=positive(float), default=2.0, metavar="M", help=help_)
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Compress a file.
 
     Returns:
         0, or 130 where Ctrl-C has ended a training early.
 
     Raises:
-        argparse.ArgumentError: Options do not go together.
+        ArgumentError: Options do not go together.
         ValueError: The scene cannot be used, or a limit cannot be met.
         OSError: A file cannot be read or written.
     """
@@ -106,7 +106,7 @@ def run(options: argparse.Namespace) -> int:
     elif options.levels and not streamed:
         wrong = f"--levels is for {NAME}, but the output is {options.output}"
     if wrong:
-        raise argparse.ArgumentError(None, wrong)
+        raise ArgumentError(None, wrong)
     scene, cameras, photos = scene_with_views(read_scene(options.input), options.input, options.root)
     most = splats_left(options.splats, len(scene))
     from nsvq_lightning.compression.compressor import Compressor
@@ -120,7 +120,7 @@ def run(options: argparse.Namespace) -> int:
     return 130 if compressor.stopped else 0
 
 
-def _write_levels(options: argparse.Namespace, compressor: "Compressor", most: int) -> None:
+def _write_levels(options: Namespace, compressor: "Compressor", most: int) -> None:
     """Write a streamed SOG of levels of detail, the finest of ``most`` splats."""
     from nsvq_lightning.compression.compressor import Setting
     from nsvq_lightning.io.formats import save
@@ -134,7 +134,7 @@ def _write_levels(options: argparse.Namespace, compressor: "Compressor", most: i
     say(f"{options.output}: levels of {counts} splats, {size:,} bytes")
 
 
-def _write_file(options: argparse.Namespace, compressor: "Compressor", most: int, views: str) -> None:
+def _write_file(options: Namespace, compressor: "Compressor", most: int, views: str) -> None:
     """Write the ``.nsvq`` file of at most ``most`` splats that is asked for."""
     candidate = compressor.best(most, options.codebooks, options.target_bytes, options.max_error)
     make_folder_of(options.output)

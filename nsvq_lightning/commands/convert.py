@@ -11,8 +11,8 @@ Examples:
   nsvq convert scene.nsvq clean.nsvq --floaters --up z --data.root my/scene
 """
 
-import argparse
 import logging
+from argparse import ArgumentError, ArgumentParser, Namespace
 from functools import partial
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from nsvq_lightning.io.sog import PALETTE_LIMIT
 from nsvq_lightning.splats.conventions import Float64s
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add what ``nsvq convert`` takes."""
     add = parser.add_argument
     add("inputs", nargs="+", type=Path, metavar="SCENE", help=f"files to read and join: {', '.join(formats.FORMATS)}")
@@ -60,17 +60,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_root(parser, "scene folder for --floaters, --up, --align; for --measure, --splats in place of its own pictures")
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Convert a file.
 
     Raises:
-        argparse.ArgumentError: Options do not go together.
+        ArgumentError: Options do not go together.
         ValueError: A file cannot be understood, or nothing is left of the scene.
         OSError: A file cannot be read or written.
     """
     wrong = _contradiction(options)
     if wrong:
-        raise argparse.ArgumentError(None, wrong)
+        raise ArgumentError(None, wrong)
     output = options.output
     # Now, not after the minutes that floaters take.
     entry = formats.format_of(output)
@@ -94,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
 WRITER_OPTIONS = {"level": (".nsvq",), "palette": (".sog", lod.NAME), "spz_version": (".spz",), "spz_axes": (".spz",)}
 
 
-def _contradiction(options: argparse.Namespace) -> str:
+def _contradiction(options: Namespace) -> str:
     """Why options do not go together; empty if they do."""
     moves = options.up or options.matrix or options.align
     uses_photos = options.measure or options.floaters or options.up or options.align or options.splats
@@ -120,7 +120,7 @@ def _contradiction(options: argparse.Namespace) -> str:
     return ""
 
 
-def _edited(scene: CompressedScene, options: argparse.Namespace) -> CompressedScene:
+def _edited(scene: CompressedScene, options: Namespace) -> CompressedScene:
     """The scene within the box, without floaters, thinned, turned and moved, up to a degree, in this order."""
     before = len(scene)
     if options.crop is not None:
@@ -148,7 +148,7 @@ def _edited(scene: CompressedScene, options: argparse.Namespace) -> CompressedSc
     return scene.in_use() if len(scene) < before else scene
 
 
-def _up(options: argparse.Namespace) -> Float64s:
+def _up(options: Namespace) -> Float64s:
     """Where up is in the input, a unit vector ``[3]``."""
     if options.up_from is None:
         from nsvq_lightning.rendering.poses import up_of
@@ -182,7 +182,7 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     return scene.take((~removed).numpy())
 
 
-def _thinned(scene: CompressedScene, count: int, options: argparse.Namespace) -> CompressedScene:
+def _thinned(scene: CompressedScene, count: int, options: Namespace) -> CompressedScene:
     """The splats that contribute most to photos of --data.root, or to the scene's own pictures."""
     from nsvq_lightning.compression.viewpoints import VIEWS
     from nsvq_lightning.random import top_rows

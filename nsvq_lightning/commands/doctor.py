@@ -8,12 +8,12 @@ Examples:
   nsvq doctor path/to/scene > doctor.txt
 """
 
-import argparse
 import logging
 import os
 import platform
 import re
 import shutil
+from argparse import ArgumentParser, Namespace
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from nsvq_lightning.data.scene import Scene
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add what ``nsvq doctor`` takes."""
     parser.add_argument("folder", nargs="?", type=Path, metavar="FOLDER", help="COLMAP folder to check")
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Check this machine and, if given, a scene folder.
 
     Returns:

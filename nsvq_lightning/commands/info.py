@@ -1,7 +1,7 @@
 """Describe a scene file of any format; of .nsvq, also its attributes and streams."""
 
-import argparse
 import json
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from nsvq_lightning.commands import markdown_table, say
@@ -10,13 +10,13 @@ from nsvq_lightning.io.errors import Json
 from nsvq_lightning.io.formats import describe
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add what ``nsvq info`` takes."""
     parser.add_argument("file", type=Path, metavar="FILE", help="file of any format that convert reads")
     parser.add_argument("--json", action="store_true", help="print the description as JSON")
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Print the description of one file, without importing torch."""
     description = describe(options.file)
     say(json.dumps(description, indent=2, ensure_ascii=False) if options.json else _text(description))

@@ -1,9 +1,6 @@
 """The ``nsvq`` command. Kept light: ``nsvq info`` must answer without importing torch."""
 
-import argparse
-import functools
 import gc
-import inspect
 import io
 import logging
 import os
@@ -11,8 +8,11 @@ import re
 import signal
 import sys
 import warnings
+from argparse import ArgumentError, RawDescriptionHelpFormatter
 from collections.abc import Sequence
+from functools import cache
 from importlib import import_module
+from inspect import cleandoc
 from traceback import walk_tb
 from typing import Any, TextIO
 
@@ -115,7 +115,7 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     """Run a command that is not Lightning's.
 
     The docstring of its module is what ``--help`` shows around the options; its ``add_arguments(parser)`` adds them.
-    Its ``run(options)`` does the work. It raises :class:`argparse.ArgumentError` for options that do not go together,
+    Its ``run(options)`` does the work. It raises :class:`ArgumentError` for options that do not go together,
     and :class:`ValueError` or :class:`OSError` for what is wrong with the user's files.
 
     Args:
@@ -126,9 +126,8 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
         Exit status: what ``run`` returns, or 1 after an error in the user's files.
     """
     command = import_module(f"{__package__}.{name}")
-    about, _, more = inspect.cleandoc(command.__doc__ or "").partition("\n\n")
-    as_written = argparse.RawDescriptionHelpFormatter
-    parser = Parser(prog=f"nsvq {name}", description=about, epilog=more, formatter_class=as_written)
+    about, _, more = cleandoc(command.__doc__ or "").partition("\n\n")
+    parser = Parser(prog=f"nsvq {name}", description=about, epilog=more, formatter_class=RawDescriptionHelpFormatter)
     command.add_arguments(parser)
     options, further = parser.parse_known_args(arguments)
     if further:
@@ -140,7 +139,7 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     _show_log()
     try:
         return int(command.run(options))
-    except argparse.ArgumentError as error:
+    except ArgumentError as error:
         parser.error(str(error))
     except (ValueError, OSError) as error:
         text = str(error)
@@ -156,7 +155,7 @@ def _run_lightning(arguments: list[str], own_process: bool) -> int:
     try:
         arguments = expand(arguments)
         check_early(arguments)
-    except argparse.ArgumentError as error:
+    except ArgumentError as error:
         sys.stderr.write(f"error: {error}\nAll options: nsvq {arguments[0]} --help\n")
         sys.exit(2)
     except (ValueError, OSError) as error:
@@ -205,7 +204,7 @@ def _run_lightning(arguments: list[str], own_process: bool) -> int:
     return 0
 
 
-@functools.cache
+@cache
 def _import_cli(own_process: bool) -> Any:
     """Our :class:`LightningCLI`; to look for garbage among what it imports would take a second here, two at the end.
 

@@ -4,7 +4,7 @@ Examples:
   nsvq merge parts -o scene.nsvq
 """
 
-import argparse
+from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +12,13 @@ from nsvq_lightning.commands import say
 from nsvq_lightning.commands.split import RUN
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add what ``nsvq merge`` takes."""
     parser.add_argument("parts", type=Path, metavar="PARTS", help="folder that 'nsvq split' has made")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="file to write, of any format")
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Join what lies in the core of each part.
 
     Raises:

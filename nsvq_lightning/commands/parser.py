@@ -5,11 +5,11 @@ import json
 import re
 import shutil
 import sys
-import textwrap
 from argparse import SUPPRESS
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from pkgutil import resolve_name
+from textwrap import wrap
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
 from jsonargparse import Namespace
@@ -221,4 +221,4 @@ MAX_WIDTH = 100
 
 def _wrapped(text: str, indent: str) -> list[str]:
     width = min(shutil.get_terminal_size().columns, MAX_WIDTH)
-    return textwrap.wrap(text, width, initial_indent=indent, subsequent_indent=indent)
+    return wrap(text, width, initial_indent=indent, subsequent_indent=indent)

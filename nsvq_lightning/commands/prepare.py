@@ -9,9 +9,9 @@ Examples:
   nsvq prepare walk.mp4 scenes/garden --frames 200
 """
 
-import argparse
 import json
 import shlex
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from nsvq_lightning.data.reconstruct import Report
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add what ``nsvq prepare`` takes."""
     add = parser.add_argument
     add("source", type=Path, metavar="SOURCE", help="folder of photos, or a video")
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--again", action="store_true", help="begin anew instead of continuing")
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Prepare a scene, check it as ``nsvq doctor`` does, and say what to type next.
 
     Returns:
@@ -103,7 +103,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _frames(options: argparse.Namespace, images: Path, report: "Report") -> list[str]:
+def _frames(options: Namespace, images: Path, report: "Report") -> list[str]:
     """The names of the frames of a video, which are chosen unless that was done."""
     from nsvq_lightning.data import reconstruct
 
@@ -115,7 +115,7 @@ def _frames(options: argparse.Namespace, images: Path, report: "Report") -> list
     return names
 
 
-def _claim(options: argparse.Namespace, is_video: bool, in_place: bool) -> None:
+def _claim(options: Namespace, is_video: bool, in_place: bool) -> None:
     """Take the folder of the scene; what another preparation has left in it is continued."""
     from nsvq_lightning.data import reconstruct
 

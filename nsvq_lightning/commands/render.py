@@ -10,10 +10,10 @@ Examples:
   nsvq render scene.nsvq --data.root scenes/fox --path cameras -o frames/
 """
 
-import argparse
 import logging
 import math
 import re
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -34,7 +34,7 @@ FPS = 24.0
 SECONDS = 10.0
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add what ``nsvq render`` takes."""
     add = parser.add_argument
     add("scene", type=Path, metavar="SCENE", help="file of any format that convert reads, or the folder of a run")
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"0*([1-9]\d*)x0*([1-9]\d*)", text.lower())
     if match is None:
-        raise argparse.ArgumentTypeError(f"must be like 1280x720, got {text}")
+        raise ArgumentTypeError(f"must be like 1280x720, got {text}")
     return int(match[1]), int(match[2])
 
 
@@ -65,11 +65,11 @@ def _color(text: str) -> tuple[float, ...]:
     except ValueError:
         values = ()
     if len(values) != 3 or not all(0 <= value <= 1 for value in values):
-        raise argparse.ArgumentTypeError(f"must be black, white, or three numbers from 0 to 1 like 1,0.5,0, got {text}")
+        raise ArgumentTypeError(f"must be black, white, or three numbers from 0 to 1 like 1,0.5,0, got {text}")
     return values
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Render a path.
 
     Raises:
@@ -110,7 +110,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _path(
-    options: argparse.Namespace, splats: "Splats", cameras: "list[Camera]", is_video: bool
+    options: Namespace, splats: "Splats", cameras: "list[Camera]", is_video: bool
 ) -> "tuple[list[Camera], float]":
     """The cameras and frames per second that the options ask for, given those of the photos, if any are known."""
     from nsvq_lightning.compression.viewpoints import likely_cameras

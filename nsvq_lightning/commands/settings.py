@@ -1,8 +1,8 @@
 """Settings of ``nsvq fit`` as they are typed: configs by name, short options, and what is refused without Lightning."""
 
-import argparse
 import json
 import re
+from argparse import ArgumentError
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -82,7 +82,7 @@ def check_early(arguments: Sequence[str]) -> None:
         arguments: Expanded ones, after the command.
 
     Raises:
-        argparse.ArgumentError: There is no such config, or no such option.
+        ArgumentError: There is no such config, or no such option.
         FileNotFoundError: There is no such scene folder.
         ValueError: A config cannot be read, or the folder says nothing of cameras.
     """
@@ -92,7 +92,7 @@ def check_early(arguments: Sequence[str]) -> None:
         if not Path(config).is_file():
             shipped = sorted(path.stem for path in folder_of("configs").glob("*.yaml"))
             meant = f"{nearest(Path(config).stem, shipped)}\nShipped ones: {', '.join(shipped)}"
-            raise argparse.ArgumentError(None, f"there is no config {config}{meant}")
+            raise ArgumentError(None, f"there is no config {config}{meant}")
     own = values_by_name(options)
     given = values_by_name(settings_of(configs)) | own
     asks = any(name == "print_config" or name.endswith("help") for name in given)
@@ -107,7 +107,7 @@ def check_early(arguments: Sequence[str]) -> None:
     if asks or other_data:
         return
     if root is None:
-        raise argparse.ArgumentError(None, "which scene? Name its folder: --data.root=path/to/scene")
+        raise ArgumentError(None, "which scene? Name its folder: --data.root=path/to/scene")
     from nsvq_lightning.data import colmap
 
     if "data.model" not in given and not any(folder.glob("transforms*.json")):
@@ -119,7 +119,7 @@ def _check_options(options: Sequence[str], own: Mapping[str, str], other_data: b
     stray = [option for option in options if not option.startswith("--")]
     if stray:
         place = next((option for option in stray if Path(option).exists()), "path/to/scene")
-        raise argparse.ArgumentError(None, f"{stray[0]} is no option; the scene folder is --data.root={place}")
+        raise ArgumentError(None, f"{stray[0]} is no option; the scene folder is --data.root={place}")
     if any(version(name) != known for name, known in FIT_HELP_OF.items()):
         return  # options of another version are known to its parser only
     listed = re.findall(r"--([\w.]+)", FIT_HELP.read_text(encoding="utf-8"))
@@ -136,7 +136,7 @@ def _check_options(options: Sequence[str], own: Mapping[str, str], other_data: b
         meant = nearest(f"--{name}", (f"--{each}" for each in known))
         if value and Path(value).is_dir():
             meant = f"; the scene folder is --data.root={value}"
-        raise argparse.ArgumentError(None, f"there is no option --{name}{meant}")
+        raise ArgumentError(None, f"there is no option --{name}{meant}")
 
 
 def find_config(name: str) -> str:

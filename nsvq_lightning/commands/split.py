@@ -10,10 +10,10 @@ Examples:
   nsvq merge parts -o scene.nsvq
 """
 
-import argparse
 import shlex
 import shutil
 import sys
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from nsvq_lightning.commands import say
@@ -26,7 +26,7 @@ RUN = "run"
 AS_WRITTEN = "--data.factor=1", "--data.images_folder=images", "--data.model=null", "--data.masks=masks"
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add what ``nsvq split`` takes; what it does not know are options of ``nsvq fit``."""
     parser.usage = "nsvq split SCENE OUT [--blocks N] [options of nsvq fit]"
     parser.allow_abbrev = False
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--blocks", type=positive(int), default=4, metavar="N", help="number of parts; 4 by default")
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Write the parts, and print the commands that train them.
 
     Raises:

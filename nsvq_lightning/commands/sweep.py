@@ -8,8 +8,6 @@ Examples:
   nsvq sweep --scenes fox,horns --configs paper,plain,own.yaml --output sweeps/own
 """
 
-import argparse
-import hashlib
 import io
 import json
 import logging
@@ -19,12 +17,14 @@ import shutil
 import signal
 import subprocess
 import sys
-import warnings
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
+from hashlib import sha256
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
+from warnings import catch_warnings
 
 import numpy as np
 
@@ -45,7 +45,7 @@ CHANCE = 0.05
 CHECKPOINT = Path("checkpoints", "last.ckpt")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add what ``nsvq sweep`` takes; what it does not know are options of ``nsvq fit``."""
     parser.usage = "nsvq sweep --output FOLDER [options] [options of nsvq fit]"
     parser.allow_abbrev = False
@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--commands", action="store_true", help=help_)
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Train what is missing and write the tables.
 
     Returns:
@@ -120,7 +120,7 @@ class Run(NamedTuple):
         return (self.folder / "metrics.json").is_file()
 
 
-def plan(options: argparse.Namespace) -> list[Run]:
+def plan(options: Namespace) -> list[Run]:
     """All runs that options of ``nsvq sweep`` ask for, one configuration after the other.
 
     Quantizers and codebook sizes are only for configurations that have codebooks.
@@ -174,7 +174,7 @@ def plan(options: argparse.Namespace) -> list[Run]:
             title = "-".join(str(name) for name in labels.values() if name != "")
             if any(run.names == labels for run in runs):
                 raise ValueError(f"two runs are called {title}: rename a scene or configuration to tell them apart")
-            digest = hashlib.sha256(f"{__version__}\n{text}".encode()).hexdigest()
+            digest = sha256(f"{__version__}\n{text}".encode()).hexdigest()
             runs.append(Run(labels, text, options.output.resolve() / "runs" / f"{title}-{digest[:12]}"))
     return runs
 
@@ -194,7 +194,7 @@ def resolve(arguments: Sequence[str]) -> str:
     from nsvq_lightning.commands.fit import SplatCLI
 
     printed = io.StringIO()
-    with warnings.catch_warnings(action="ignore"), redirect_stdout(printed):
+    with catch_warnings(action="ignore"), redirect_stdout(printed):
         try:
             SplatCLI(["fit", *expand(arguments), "--print_config"])
         except SystemExit as end:

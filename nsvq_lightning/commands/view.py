@@ -7,18 +7,18 @@ Examples:
   nsvq view scene.nsvq -o scene.html            one file to send to somebody, no server
 """
 
-import argparse
 import io
 import os
 import shutil
 import sys
-import tempfile
 import webbrowser
+from argparse import ArgumentError, ArgumentParser, Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add what ``nsvq view`` takes."""
     add = parser.add_argument
     add("scene", type=Path, metavar="SCENE", help="file of any format that convert reads, or the folder of a run")
@@ -46,20 +46,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 _LARGEST = 400_000_000
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Serve a scene until Ctrl-C, or write its page.
 
     Raises:
-        argparse.ArgumentError: Options contradict each other.
+        ArgumentError: Options contradict each other.
         ValueError: The scene is empty, or it is not known where the photos of a running fit are.
         OSError: A file cannot be read or written, or the port is taken.
     """
     from nsvq_lightning.report.viewer import LIVE_SCENE, viewer_page, write_viewer
 
     if options.live and (options.output is not None or not options.scene.is_dir()):
-        raise argparse.ArgumentError(None, "--live follows a running fit: give the folder of the run, and no --output")
+        raise ArgumentError(None, "--live follows a running fit: give the folder of the run, and no --output")
     if options.output is not None and options.output.suffix.lower() not in (".html", ".htm"):
-        raise argparse.ArgumentError(None, f"{options.output}: a page is named .html; nsvq convert writes scene files")
+        raise ArgumentError(None, f"{options.output}: a page is named .html; nsvq convert writes scene files")
     path = options.scene.resolve()
     title = f"{path.parent.name} / {path.name}" if path.is_dir() else path.name
     with _nsvq_file(options) as file:
@@ -89,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
+def _nsvq_file(options: Namespace) -> Iterator[Path]:
     """The scene that is meant, as a ``.nsvq`` file; that of a running fit is yet to come."""
     from nsvq_lightning.io.formats import save
     from nsvq_lightning.io.nsvq.header import read_header
@@ -99,13 +99,13 @@ def _nsvq_file(options: argparse.Namespace) -> Iterator[Path]:
     if options.live or (file.suffix.lower() == ".nsvq" and (options.root is None or read_header(file).cameras)):
         yield file
         return
-    with tempfile.TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder:
         made = Path(folder) / "scene.nsvq"
         save(trained_scene(file, options.root), made, "paper")
         yield made
 
 
-def _cameras(options: argparse.Namespace, file: Path) -> "dict[str, Camera]":
+def _cameras(options: Namespace, file: Path) -> "dict[str, Camera]":
     """Cameras of the photos, or guessed ones."""
     from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.io.formats import read_scene

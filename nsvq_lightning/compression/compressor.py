@@ -2,11 +2,11 @@
 
 import logging
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, Literal
+from warnings import catch_warnings
 
 import numpy as np
 import torch
@@ -416,7 +416,7 @@ class Compressor:
         chatter.setLevel(logging.WARNING)
         trim()
         try:
-            with warnings.catch_warnings(action="ignore"):
+            with catch_warnings(action="ignore"):
                 trainer = SplatTrainer(max_steps=steps, callbacks=callbacks, enable_checkpointing=False)
                 trainer.fit(module, self.data)
         except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other

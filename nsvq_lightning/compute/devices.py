@@ -5,10 +5,10 @@ from step to step, such as that of the splats in view, are named in ``do_not_spe
 the middle of a run.
 """
 
-import importlib.util
 import logging
 import os
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -97,7 +97,7 @@ def _obstacle(kernels: str, like: Tensor) -> str | None:
 @cache
 def _has_triton() -> bool:
     """Whether a Triton that can compile the kernels is installed; a render with ``backend="cuda"`` asks each time."""
-    triton = importlib.util.find_spec("triton")
+    triton = find_spec("triton")
     folders = (triton and triton.submodule_search_locations) or ()
     # Before 3.4, without this file, it has no tuples of tuples.
     return any(Path(folder, "knobs.py").is_file() for folder in folders)

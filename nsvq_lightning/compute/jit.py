@@ -4,12 +4,12 @@ A kernel is compiled at its first call on a machine and read from the disk cache
 training, so clocks leave it out.
 """
 
-import contextlib
-import functools
 import logging
 import os
-import time
 from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from time import perf_counter
 from typing import Any
 from weakref import WeakSet
 
@@ -59,7 +59,7 @@ class _Compilations(event.Listener):
         if compilation.data["dispatcher"] not in _ours:
             return
         if not self.levels:
-            self.since = time.perf_counter()
+            self.since = perf_counter()
             if self.seconds == 0:
                 log.info("compiling kernels, once on this machine: a quarter of a minute to one")
         level = numba.config.OPT
@@ -76,7 +76,7 @@ class _Compilations(event.Listener):
             dispatcher._cache.let_go()
         numba.config.OPT = self.levels.pop()
         if not self.levels:
-            self.seconds += time.perf_counter() - self.since
+            self.seconds += perf_counter() - self.since
 
 
 _compilations = _Compilations()
@@ -85,7 +85,7 @@ event.register("numba:compile", _compilations)
 
 def compile_seconds() -> float:
     """Seconds spent compiling CPU kernels in this process so far, or waiting for one that compiles them."""
-    in_progress = time.perf_counter() - _compilations.since if _compilations.levels else 0.0
+    in_progress = perf_counter() - _compilations.since if _compilations.levels else 0.0
     return _compilations.seconds + in_progress + kernel_cache.seconds_waited
 
 
@@ -97,7 +97,7 @@ class _Cache(kernel_cache.KernelCache):
         return super()._load_overload(sig, target_context)
 
 
-@functools.cache
+@cache
 def _start_threads() -> None:
     """Start Numba's threads, which tells OpenMP to use all cores, and give torch its own setting back."""
     _started.append(os.getpid())
@@ -143,7 +143,7 @@ def kernel(function: Callable[..., Any], allocates: bool = True) -> Any:
     """
     dispatcher = numba.njit(_nrt=allocates, **_OPTIONS)(function)
     _ours.add(dispatcher)
-    with contextlib.suppress(RuntimeError):  # nowhere to keep it
+    with suppress(RuntimeError):  # nowhere to keep it
         dispatcher._cache = _Cache(function)
     return dispatcher
 

@@ -5,16 +5,16 @@ changes: too late, since a kernel contains the code of its helpers and constants
 still Numba's own, lie in a folder named after a digest of the sources of a kernel's module and of all that it imports.
 """
 
-import functools
-import hashlib
 import logging
 import re
 import shutil
 import sys
-import tempfile
-import time
+from functools import cache
+from hashlib import sha256
 from importlib.util import resolve_name
 from pathlib import Path
+from tempfile import TemporaryFile
+from time import perf_counter
 from typing import Any
 
 import numba
@@ -25,7 +25,7 @@ from numba.misc.appdirs import AppDirs
 log = logging.getLogger(__name__)
 
 
-@functools.cache
+@cache
 def source_digest(module: str) -> str:
     """SHA-256 of the source of a module and of all that it imports from its own top-level package, directly or not.
 
@@ -48,16 +48,16 @@ def source_digest(module: str) -> str:
                     base = resolve_name(base, package)
                     waiting += [base, *(f"{base}.{part}" for part in re.findall(r"\w+", names))]
     settings = sys.version, numba.config.USING_SVML, numba.config.BOUNDSCHECK  # which change the code of a kernel
-    return hashlib.sha256(repr((settings, sorted(digests.items()))).encode()).hexdigest()
+    return sha256(repr((settings, sorted(digests.items()))).encode()).hexdigest()
 
 
-@functools.cache
+@cache
 def _read(path: Path) -> tuple[bytes, list[Any]]:
     """The digest of a source, and its imports."""
     source = path.read_bytes()
     # Those that are not in a function: a module and names, or modules.
     imports = re.findall(r"^(?:from +([\w.]+) +import +(\([^)]*\)|.*)|import +(.*))", source.decode(), re.MULTILINE)
-    return hashlib.sha256(source).digest(), imports
+    return sha256(source).digest(), imports
 
 
 def _file_of(name: str, module: str) -> Path | None:
@@ -80,13 +80,13 @@ def kernel_folder() -> Path | None:
     return _writable(str(numba.config.CACHE_DIR))
 
 
-@functools.cache
+@cache
 def _writable(chosen: str) -> Path | None:
     own = Path(chosen, "nsvq_lightning") if chosen else Path(AppDirs("nsvq_lightning", appauthor=False).user_cache_dir)
     folder = own / f"kernels-numba-{numba.__version__}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
+        TemporaryFile(dir=folder).close()
     except OSError:
         return None
     return folder
@@ -169,7 +169,7 @@ class KernelCache(FunctionCache):
     def _locked(self, sig: Any, target_context: Any) -> Any:
         """The kernel if another process has compiled it by the time that this one may; None holds the lock."""
         global seconds_waited
-        begin, lock = time.perf_counter(), FileLock(f"{self._cache_file._index_path}.lock")
+        begin, lock = perf_counter(), FileLock(f"{self._cache_file._index_path}.lock")
         try:
             Path(self._cache_path).mkdir(exist_ok=True)
             lock.acquire(timeout=PATIENCE if waits else 0)
@@ -177,7 +177,7 @@ class KernelCache(FunctionCache):
         except Timeout:
             if not waits:
                 raise BusyError from None
-        seconds_waited += time.perf_counter() - begin
+        seconds_waited += perf_counter() - begin
         found = super()._load_overload(sig, target_context)
         if found is not None:
             self.let_go()

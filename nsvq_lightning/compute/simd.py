@@ -12,8 +12,8 @@ bounds-checked. Floating-point code may be contracted (a·b + c with one roundin
 infinity keep their meaning.
 """
 
-import functools
 import operator
+from functools import partial, wraps
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ WIDTH = 16
 _f32, _i1, _i8, _i16, _i32, _i64 = ir.FloatType(), *(ir.IntType(bits) for bits in (1, 8, 16, 32, 64))
 _VF, _VI, _VM = (ir.VectorType(kind, WIDTH) for kind in (_f32, _i32, _i1))
 _CONTRACT = ("contract", "nsz")
-_add = functools.partial(ir.IRBuilder.fadd, flags=_CONTRACT)
+_add = partial(ir.IRBuilder.fadd, flags=_CONTRACT)
 
 # Stands for the type of the elements of the first argument.
 _ELEMENT = object()
@@ -86,7 +86,7 @@ def _function(result, *parameters):
             return context.get_dummy_value() if sig.return_type == types.void else made
 
         @intrinsic
-        @functools.wraps(emit)  # from which Numba reads the number of arguments
+        @wraps(emit)  # from which Numba reads the number of arguments
         def declare(typingctx, *given):
             def settled(kind, argument=None):
                 if kind is _ELEMENT:
@@ -171,8 +171,8 @@ def _compared(symbol):
 
 _TWO = (Lanes, Lanes)
 _operator(operator.add, Lanes, _TWO, _add)
-_operator(operator.sub, Lanes, _TWO, functools.partial(ir.IRBuilder.fsub, flags=_CONTRACT))
-_operator(operator.mul, Lanes, _TWO, functools.partial(ir.IRBuilder.fmul, flags=_CONTRACT))
+_operator(operator.sub, Lanes, _TWO, partial(ir.IRBuilder.fsub, flags=_CONTRACT))
+_operator(operator.mul, Lanes, _TWO, partial(ir.IRBuilder.fmul, flags=_CONTRACT))
 _operator(operator.truediv, Lanes, _TWO, ir.IRBuilder.fdiv)
 _operator(operator.neg, Lanes, (Lanes,), ir.IRBuilder.fneg)
 _operator(operator.ge, Mask, _TWO, _compared(">="))

@@ -3,10 +3,10 @@
 The only place that imports pycolmap.
 """
 
-import contextlib
 import logging
 import math
 from collections.abc import Callable, Iterable, Sequence, Sized
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise, takewhile
 from pathlib import Path, PurePath
@@ -14,7 +14,7 @@ from typing import Any, ClassVar, TypeVar
 
 import cv2  # noqa: F401  (before pycolmap, see import_pycolmap)
 import numpy as np
-import PIL.Image
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.data import NO_FOLDER
@@ -136,7 +136,7 @@ def import_pycolmap() -> Any:
     Raises:
         SceneError: It is not installed.
     """
-    PIL.Image.preinit()  # loads Pillow's own image libraries, which a bare import leaves for later
+    Image.preinit()  # loads Pillow's own image libraries, which a bare import leaves for later
     try:
         import pycolmap
     except ModuleNotFoundError as error:
@@ -420,7 +420,7 @@ def larger_models(root: Path) -> str | None:
     for folder in (root / "sparse").glob("*"):
         files = _tables_in(folder)
         if files is not None:
-            with contextlib.suppress(ValueError, OSError):
+            with suppress(ValueError, OSError):
                 counts[folder.name] = len(tables.read_images(files["images"]))
     first = counts.get("0", math.inf)
     larger = [f"sparse/{name} has {count}" for name, count in sorted(counts.items()) if count > first]

@@ -1,7 +1,7 @@
 """Points that SfM does not find: where the photos have detail, from the flow between neighbours, and far away."""
 
-import itertools
 import math
+from itertools import chain
 from typing import NamedTuple
 
 import cv2
@@ -96,7 +96,7 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
         pixels = 2 * len(pairs) * photos[0].grey.size
         stride = max(2, math.ceil(math.sqrt(pixels / MAX_CANDIDATES)))
         found = in_parallel(lambda pair: _flows(*pair, stride), pairs, "dense start: flows")
-        by_flow = sum(len(points) for points, *_ in itertools.chain(*found))
+        by_flow = sum(len(points) for points, *_ in chain(*found))
         pairs = _neighbours(photos, *WIDE) if scene.grey else []
         found.append(in_parallel(lambda pair: _matched(*pair), pairs, "dense start: features"))
     finally:
@@ -105,7 +105,7 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
         return torch.empty(0, 3), torch.empty(0, 3)
     edge = CELL * np.median([photo.depth for photo in photos])
     del photos, pairs
-    positions, colors, detail = (np.concatenate(parts) for parts in zip(*itertools.chain(*found), strict=True))
+    positions, colors, detail = (np.concatenate(parts) for parts in zip(*chain(*found), strict=True))
     found.clear()
     # Cells by one number each: 2^21 along an axis.
     cells = np.zeros(len(positions), np.int64)

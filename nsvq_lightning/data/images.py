@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-import PIL.Image
 import torch
+from PIL import Image
 from PIL.ExifTags import Base
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
@@ -24,9 +24,9 @@ from nsvq_lightning.io.atomic import make_folder_of, write_bytes
 from nsvq_lightning.splats.conventions import Arrays, Bools, Uint8s
 
 # Pillow refuses twice as many, and by default fewer than phones have.
-PIL.Image.MAX_IMAGE_PIXELS = 1 << 27
+Image.MAX_IMAGE_PIXELS = 1 << 27
 # What Pillow raises for a file that is damaged, not a picture, or beyond that limit.
-DAMAGED = (OSError, ValueError, SyntaxError, KeyError, TypeError, struct.error, PIL.Image.DecompressionBombError)
+DAMAGED = (OSError, ValueError, SyntaxError, KeyError, TypeError, struct.error, Image.DecompressionBombError)
 # EXIF orientations from here on: stored lying on its side, so that programs that apply it swap width and height.
 ON_ITS_SIDE = 5
 
@@ -46,7 +46,7 @@ def image_head(path: Path) -> ImageHead:
         SceneError: The file is not an image, or its head declares too many pixels.
     """
     try:
-        with PIL.Image.open(path) as image:
+        with Image.open(path) as image:
             size = image.size
             # Pillow decodes a whole PNG to look for a tag that is hardly ever there.
             tags = {} if image.format == "PNG" else image.getexif()
@@ -119,7 +119,7 @@ def _decoded(path: Path, flags: int) -> Arrays:
             "there again"
         ) from error
     try:
-        with PIL.Image.open(io.BytesIO(data)) as head:
+        with Image.open(io.BytesIO(data)) as head:
             # OpenCV applies the orientation to TIFFs even when told not to.
             applied = int(head.getexif().get(Base.Orientation, 1)) if head.format == "TIFF" else 1
             _check_whole(data)

@@ -2,11 +2,11 @@
 
 import logging
 import re
-import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from glob import glob
 from pathlib import Path, PurePosixPath
+from unicodedata import normalize
 
 from nsvq_lightning.data.colmap import ColmapImage, NoPhotosError, SceneError, check_name, is_outside
 
@@ -109,7 +109,7 @@ class _Files:
 
 def _key(name: str) -> str:
     """A path as it is compared: with slashes, composed letters and no capitals."""
-    return unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
+    return normalize("NFC", name.replace("\\", "/")).casefold()
 
 
 def _stem(name: str) -> str:

@@ -1,7 +1,5 @@
 """Photos and frames of a video, and where they were taken from: COLMAP, in steps that can be continued."""
 
-import contextlib
-import importlib
 import io
 import itertools
 import json
@@ -14,16 +12,17 @@ import threading
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from statistics import median_high
 from typing import Any
 
 import cv2
 import numpy as np
-import PIL.Image
-import PIL.ImageOps
 from cv2.typing import MatLike
+from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
@@ -218,8 +217,8 @@ def _extract(
 
 def _lens_of(path: Path) -> str:
     """What EXIF says of the camera and the lens of a photo."""
-    tags = PIL.Image.Exif()
-    with PIL.Image.open(path) as image, contextlib.suppress(*DAMAGED):
+    tags = Image.Exif()
+    with Image.open(path) as image, suppress(*DAMAGED):
         # Pillow decodes a whole PNG to look for it elsewhere.
         tags.load(image.info.get("exif", b""))
     how = tags.get_ifd(IFD.Exif)
@@ -256,7 +255,7 @@ def _compare(scene: Path, count: int, report: Report, is_video: bool, threads: i
 
     def poll() -> None:
         while not ended.wait(timeout=1.0):
-            with contextlib.suppress(sqlite3.Error):
+            with suppress(sqlite3.Error):
                 done = _rows(scene, "select count(*) from two_view_geometries")[0][0]
                 report("comparing photos", min(done, pairs), pairs)
 
@@ -340,7 +339,7 @@ def _rows(scene: Path, query: str, *parameters: str) -> list[tuple[Any, ...]]:
     database = scene / DATABASE
     if not database.exists():
         return []
-    with contextlib.closing(sqlite3.connect(database)) as connection:
+    with closing(sqlite3.connect(database)) as connection:
         return connection.execute(query, parameters).fetchall()
 
 
@@ -432,10 +431,10 @@ COLMAP_READS = ("JPEG", "MPO", *LOSSLESS)
 
 def _copy(path: Path, target: Path) -> Path:
     """Copy a photo to ``target``, whose suffix may change; returns where it is."""
-    with contextlib.suppress(ImportError):
-        importlib.import_module("pillow_heif").register_heif_opener()
+    with suppress(ImportError):
+        import_module("pillow_heif").register_heif_opener()
     in_place = path == target
-    with PIL.Image.open(path) as image:
+    with Image.open(path) as image:
         if image.format == "TIFF" and path.suffix.lower() not in PHOTOS:
             raise ValueError("the preview in a raw file")
         is_plain = image.getexif().get(Base.Orientation, 1) == 1 and image.mode[0] not in "IF"
@@ -459,15 +458,15 @@ def _copy(path: Path, target: Path) -> Path:
     return target
 
 
-def _converted(image: PIL.Image.Image, path: Path, kind: str) -> bytes:
+def _converted(image: Image.Image, path: Path, kind: str) -> bytes:
     """A photo upright and in 8 bits, as a file of another kind."""
     if image.mode[0] in "IF":  # 16 bits or more, which Pillow would cut off
-        image = PIL.Image.fromarray(read_image(path))
+        image = Image.fromarray(read_image(path))
     try:
         image.getexif().tobytes()
     except DAMAGED:  # some tags are of another type than they must be
         image.info.pop("exif", None)
-    upright = PIL.ImageOps.exif_transpose(image)
+    upright = ImageOps.exif_transpose(image)
     colours = upright.convert("RGBA" if upright.has_transparency_data else "RGB")
     file = io.BytesIO()
     colours.save(file, kind, quality=JPEG_QUALITY, exif=upright.getexif())

@@ -5,13 +5,13 @@ box; level 0 is the finest. A file is a folder of SOG (:mod:`nsvq_lightning.io.s
 one level, each in Morton order.
 """
 
-import itertools
 import json
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from hashlib import sha256
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -52,7 +52,7 @@ def write_lod(
     levels = [scene, *(CompressedScene.from_splats(level).finite() for level in coarser)]
     target = Path(path)
     counts = [len(level) for level in levels]
-    if any(a <= b for a, b in itertools.pairwise(counts)):
+    if any(a <= b for a, b in pairwise(counts)):
         raise ValueError(f"each level must have fewer splats than the one before it, got {counts}")
     tree, leaves = _tree(levels)
     old = []

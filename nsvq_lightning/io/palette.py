@@ -1,6 +1,6 @@
 """Few rows, or numbers, that represent many: of cells of similar ones, always the one is cut where that gains most."""
 
-import heapq
+from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
@@ -53,11 +53,11 @@ def find_palette(rows: Float32s, weight: NDArray[np.number[Any]], count: int) ->
             gains = np.square(sums[:-1] / left - (sums[-1] - sums[:-1]) / right) * (left * right / masses[-1])
             best = int(gains.argmax())
             gain, cut = float(gains[best]) or -1.0, start + 1 + best  # equal numbers gain nothing
-        heapq.heappush(heap, (-gain, start, cut, end))
+        heappush(heap, (-gain, start, cut, end))
 
     add(0, len(rows))
     while len(heap) < count and heap[0][0] <= 0:
-        _, start, cut, end = heapq.heappop(heap)
+        _, start, cut, end = heappop(heap)
         add(start, cut)
         add(cut, end)
     labels = np.empty(len(rows), np.int64)

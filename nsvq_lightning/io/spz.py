@@ -29,7 +29,6 @@ In version 4, the header is followed by the offset of a table, 12 zero bytes, ex
 stream for each array that is not empty.
 """
 
-import gzip
 import logging
 import math
 import struct
@@ -37,6 +36,7 @@ import zlib
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from gzip import GzipFile
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -142,7 +142,7 @@ def _write_frame(path: StrPath, header: SpzHeader, arrays: Mapping[str, Arrays])
             file.writelines([start, _TABLE_OFFSET.pack(_HEAD + len(axes)), axes, *table, *streams])
         else:
             # No file name and no time stamp: the same scene gives the same bytes.
-            with gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as stream:
+            with GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as stream:
                 stream.writelines([start, *contents, axes])
         return file.tell()
 

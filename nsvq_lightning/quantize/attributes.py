@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import cast
 
 import torch
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.codebook import Quantizer, as_quantizer, held_codes
@@ -70,7 +70,7 @@ def decoded(splats: RawSplats, quantizers: Mapping[str, Quantizer]) -> RawSplats
 
 
 def noisy_rows(
-    splats: RawSplats, rows: Tensor, quantizers: Mapping[str, Quantizer], noise: Callable[[str], torch.Generator]
+    splats: RawSplats, rows: Tensor, quantizers: Mapping[str, Quantizer], noise: Callable[[str], Generator]
 ) -> RawSplats:
     """Some of the splats, their quantized attributes replaced by the training stand-in (paper, section 3.2).
 

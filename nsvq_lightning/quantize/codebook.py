@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from typing import Any, Literal, Protocol, cast
 
 import torch
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from nsvq_lightning.compute.memory import check_inside
 from nsvq_lightning.quantize.kmeans import draw_far_rows, kmeans, lookup, mean_by_code, shuffled
@@ -15,7 +15,7 @@ from nsvq_lightning.random import generator as seeded
 from nsvq_lightning.skips import is_on
 
 
-def copy_codes(active: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def copy_codes(active: Tensor, count: int, generator: Generator) -> Tensor:
     """New codes ``[count, D]`` by the paper's rule: random picks of the active codes ``[A, D]``, plus noise of 1e-12.
 
     None is picked twice before all have been picked once. In float32 the noise rarely changes a value, so a copy gets
@@ -26,7 +26,7 @@ def copy_codes(active: Tensor, count: int, generator: torch.Generator) -> Tensor
     return active[torch.cat(order)[:count]] + 1e-12 * noise.to(active)
 
 
-def split_codes(active: Tensor, rows: Tensor, count: int, jitter: float, generator: torch.Generator) -> Tensor:
+def split_codes(active: Tensor, rows: Tensor, count: int, jitter: float, generator: Generator) -> Tensor:
     """New codes next to the active ones with the largest distortion, each placed where it takes over rows at once.
 
     For each far row x that is drawn (:func:`~nsvq_lightning.quantize.kmeans.draw_far_rows`), its code c is split: the
@@ -100,7 +100,7 @@ class CodebookQuantizer(nn.Module, ABC):
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
 
     @abstractmethod
-    def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator, rows: Tensor | None) -> Tensor:
+    def approximate(self, x: Tensor, codes: Tensor, generator: Generator, rows: Tensor | None) -> Tensor:
         """Differentiable stand-in ``[V, D]`` in training for rows ``[V]`` of ``x [N, D]`` with codes ``[V]``.
 
         ``rows`` is ascending; without it, all rows of ``x`` in order.
@@ -121,7 +121,7 @@ class CodebookQuantizer(nn.Module, ABC):
         """Whether :meth:`freeze` has fixed the codes."""
         return self.codes.numel() > 0
 
-    def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
+    def fit(self, x: Tensor, weight: Tensor | None = None, generator: Generator | None = None) -> None:
         """Place the codebook on rows by k-means; K becomes at most the number of distinct rows, whatever it was before.
 
         The parameter stays the same object, since an optimiser group refers to it; fit before its first optimiser step.
@@ -156,7 +156,7 @@ class CodebookQuantizer(nn.Module, ABC):
         self._resize(min(codes, self.num_codes))
 
     def forward(
-        self, x: Tensor, generator: torch.Generator | None = None, rows: Tensor | None = None
+        self, x: Tensor, generator: Generator | None = None, rows: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Quantize rows; in training this also counts the codes that are hit.
 
@@ -205,7 +205,7 @@ class CodebookQuantizer(nn.Module, ABC):
         self.window.zero_()
 
     @torch.no_grad()
-    def replace_unused(self, generator: torch.Generator, rows: Tensor | None = None, jitter: float = 0.5) -> Tensor:
+    def replace_unused(self, generator: Generator, rows: Tensor | None = None, jitter: float = 0.5) -> Tensor:
         """Replace inactive codes by active ones and start a new window (paper, section 3.1).
 
         A code is inactive if it was hit in fewer than 1 % of the window's iterations. By the paper's rule the new codes
@@ -241,7 +241,7 @@ class CodebookQuantizer(nn.Module, ABC):
         return replaced
 
     @torch.no_grad()
-    def mend(self, broken: Tensor, rows: Tensor, generator: torch.Generator) -> None:
+    def mend(self, broken: Tensor, rows: Tensor, generator: Generator) -> None:
         """Repair codes that have become non-finite; at least one other code must be finite.
 
         A frozen code becomes the mean of the rows that have it; any other becomes a copy of a random finite code, like
@@ -341,11 +341,11 @@ class Quantizer(Protocol):
     usage: Tensor
     window: Tensor
 
-    def fit(self, x: Tensor, weight: Tensor | None = None, generator: torch.Generator | None = None) -> None:
+    def fit(self, x: Tensor, weight: Tensor | None = None, generator: Generator | None = None) -> None:
         """Place the codebook on the rows ``x [N, D]`` (k-means); ``K`` shrinks to the number of distinct rows."""
 
     def forward(
-        self, x: Tensor, generator: torch.Generator | None = None, rows: Tensor | None = None
+        self, x: Tensor, generator: Generator | None = None, rows: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Quantize rows of ``x [N, D]`` in training: differentiable ``x_q [V, D]``, codes ``[V]``; counts the usage.
 
@@ -361,7 +361,7 @@ class Quantizer(Protocol):
     def decode(self, codes: Tensor) -> Tensor:
         """Codebook rows ``[N, D]`` of ``codes [N]``, differentiable in the codebook."""
 
-    def replace_unused(self, generator: torch.Generator, rows: Tensor | None = None, jitter: float = 0.5) -> Tensor:
+    def replace_unused(self, generator: Generator, rows: Tensor | None = None, jitter: float = 0.5) -> Tensor:
         """Replace inactive codes by active ones and restart the window; returns the replaced codes ``[R]``.
 
         Callbacks pass ``rows [N, D]`` and ``jitter`` only if configured to split codes by the distortion of these rows;

@@ -6,7 +6,7 @@ Sums of rows by code, also the gradient of a codebook, have the same bits on any
 from typing import Any, cast
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
@@ -91,7 +91,7 @@ class _Lookup(torch.autograd.Function):
 def kmeans(
     x: Tensor,
     k: int,
-    generator: torch.Generator,
+    generator: Generator,
     weight: Tensor | None = None,
     steps: int = 10,
     start: Tensor | None = None,
@@ -139,7 +139,7 @@ def kmeans(
     return centroids
 
 
-def shuffled(rows: Tensor, generator: torch.Generator) -> Tensor:
+def shuffled(rows: Tensor, generator: Generator) -> Tensor:
     """The numbers ``[N]`` of the rows ``[N, D]`` in random order."""
     return torch.randperm(len(rows), generator=generator, device=generator.device).to(rows.device)
 
@@ -158,7 +158,7 @@ def mean_by_code(x: Tensor, codes: Tensor, codebook: Tensor, weight: Tensor | No
     return torch.where(mass[:, None] > 0, means.to(codebook.dtype), codebook)
 
 
-def draw_far_rows(rows: Tensor, codebook: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def draw_far_rows(rows: Tensor, codebook: Tensor, count: int, generator: Generator) -> Tensor:
     """Indices ``[count]`` of distinct rows, drawn with probabilities that grow with the squared distance to their code.
 
     This is the D² sampling of k-means++ (Arthur and Vassilvitskii 2007), many rows at a time and without replacement.
@@ -175,7 +175,7 @@ def draw_far_rows(rows: Tensor, codebook: Tensor, count: int, generator: torch.G
     return (squared / draws.to(rows.device)).topk(min(count, int((squared > 0).sum()))).indices
 
 
-def rows_far_apart(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def rows_far_apart(rows: Tensor, count: int, generator: Generator) -> Tensor:
     """``[count, D]`` of the distinct rows ``[N, D]``, N ≥ count, that reach into all corners: a start for k-means.
 
     An eighth is a random sample; then each of three rounds draws as many far rows as there already are. Rows so close

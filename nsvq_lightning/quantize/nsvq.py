@@ -4,7 +4,7 @@ import math
 from typing import Any, cast
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
@@ -21,7 +21,7 @@ class NSVQ(CodebookQuantizer):
     input and the code. Outside training, and once codes are frozen, ``x_q`` is the code itself.
     """
 
-    def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator, rows: Tensor | None) -> Tensor:
+    def approximate(self, x: Tensor, codes: Tensor, generator: Generator, rows: Tensor | None) -> Tensor:
         """Noise substitution of the rows ``rows [V]`` of ``x [N, D]`` whose nearest codes are ``codes [V]``."""
         return noise_substitution(x, self.codebook, codes, generator, rows)
 
@@ -30,7 +30,7 @@ def noise_substitution(
     x: Tensor,
     codebook: Tensor,
     codes: Tensor,
-    generator: torch.Generator,
+    generator: Generator,
     rows: Tensor | None = None,
     *,
     aim: float = 0.0,
@@ -102,7 +102,7 @@ def _kernels(like: Tensor) -> Any:
 
 def _directions(residual: Tensor, seed: int, aim: float, spread: float) -> Tensor:
     """Unit direction vectors ``[V, D]`` for the residuals x − c."""
-    generator = torch.Generator(residual.device).manual_seed(seed)
+    generator = Generator(residual.device).manual_seed(seed)
     noise = torch.randn(residual.shape, dtype=residual.dtype, device=residual.device, generator=generator)
     return _unit(spread * noise - aim * residual)
 
@@ -138,6 +138,6 @@ class DiVeQ(CodebookQuantizer):
             raise ValueError(f"sigma must be finite and at least 0, got {sigma}")
         self.sigma = sigma
 
-    def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator, rows: Tensor | None) -> Tensor:
+    def approximate(self, x: Tensor, codes: Tensor, generator: Generator, rows: Tensor | None) -> Tensor:
         """Rows ``rows [V]`` of ``x [N, D]``, moved approximately to their codes."""
         return noise_substitution(x, self.codebook, codes, generator, rows, aim=1.0, spread=self.sigma)

@@ -3,7 +3,7 @@
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from nsvq_lightning.compute.rows import take_rows
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
@@ -20,7 +20,7 @@ class StraightThrough(CodebookQuantizer):
     CompGS searches codes only at its refits; here a row has its nearest code in every step.
     """
 
-    def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator, rows: Tensor | None) -> Tensor:
+    def approximate(self, x: Tensor, codes: Tensor, generator: Generator, rows: Tensor | None) -> Tensor:
         """The codes of the rows ``rows [V]`` of ``x [N, D]``, whose gradient goes to the rows."""
         return lookup(self.codebook.detach(), codes, x, rows)
 
@@ -44,7 +44,7 @@ class TrainedStraightThrough(CodebookQuantizer):
     ) -> None:
         super().__init__(num_codes, dim, start=start, **settings)
 
-    def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator, rows: Tensor | None) -> Tensor:
+    def approximate(self, x: Tensor, codes: Tensor, generator: Generator, rows: Tensor | None) -> Tensor:
         """The codes of the rows ``rows [V]`` of ``x [N, D]``; the gradient goes to both."""
         return lookup(self.codebook, codes, x, rows)
 
@@ -63,7 +63,7 @@ class PostHoc(CodebookQuantizer):
     """
 
     def forward(
-        self, x: Tensor, generator: torch.Generator | None = None, rows: Tensor | None = None
+        self, x: Tensor, generator: Generator | None = None, rows: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """In training, the rows ``[V, D]`` themselves, and -1 as the code of each; otherwise hard codes."""
         if self.frozen or not self.training:
@@ -71,7 +71,7 @@ class PostHoc(CodebookQuantizer):
         codes = x.new_full((len(x if rows is None else rows),), -1, dtype=torch.int64)
         return self.approximate(x, codes, generator, rows), codes
 
-    def approximate(self, x: Tensor, codes: Tensor, generator: torch.Generator | None, rows: Tensor | None) -> Tensor:
+    def approximate(self, x: Tensor, codes: Tensor, generator: Generator | None, rows: Tensor | None) -> Tensor:
         """The rows ``rows [V]`` of ``x [N, D]`` themselves."""
         return x if rows is None else take_rows(x, rows)
 

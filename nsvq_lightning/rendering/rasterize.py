@@ -1,7 +1,7 @@
 """One function renders splats; the device determines the back-end."""
 
-import importlib
 from collections.abc import Sequence
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import torch
@@ -161,4 +161,4 @@ def _module_of(backend: str, like: Tensor) -> Any:
     It has the functions ``render`` and ``visible``; see :mod:`nsvq_lightning.rendering.reference`.
     """
     name = resolve_backend(backend, like)
-    return importlib.import_module(f"{__package__}.{name}{'' if name == 'reference' else '.rasterizer'}")
+    return import_module(f"{__package__}.{name}{'' if name == 'reference' else '.rasterizer'}")

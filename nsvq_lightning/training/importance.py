@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.quality.loss import apply_mask
@@ -59,7 +59,7 @@ def row_weights(contribution: Tensor, least: float = 0.01) -> Tensor:
 
 
 def sensitivity(
-    splats: SplatTensors, camera: Camera, render: Renderer, signs: torch.Generator, mask: Tensor | None = None
+    splats: SplatTensors, camera: Camera, render: Renderer, signs: Generator, mask: Tensor | None = None
 ) -> tuple[RawSplats, Tensor]:
     """Σ (∂I/∂θ)² over the pixels and channels I of a picture, for every number θ of every splat, and the picture.
 
@@ -85,7 +85,7 @@ def sensitivity(
     return RawSplats(*(gradient.square_() for gradient in gradients)), image.detach()
 
 
-def _drawn(signs: torch.Generator, image: Tensor) -> Tensor:
+def _drawn(signs: Generator, image: Tensor) -> Tensor:
     """1 or -1 for each channel of a picture, equally likely."""
     return torch.randint(0, 2, image.shape, generator=signs, dtype=torch.int8).to(image) * 2 - 1
 
@@ -163,7 +163,7 @@ PROBES = 4
 
 
 def removal_effects(
-    splats: SplatTensors, views: Iterable[View], render: Renderer, signs: torch.Generator
+    splats: SplatTensors, views: Iterable[View], render: Renderer, signs: Generator
 ) -> tuple[Tensor, Tensor, float]:
     """What removing each splat, and no other one, does to the squared error of pictures.
 

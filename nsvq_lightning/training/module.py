@@ -13,7 +13,7 @@ import torch
 from lightning.pytorch import LightningModule
 from lightning.pytorch.callbacks import StochasticWeightAveraging, WeightAveraging
 from lightning.pytorch.utilities.model_helpers import _restricted_classmethod
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from nsvq_lightning.compute.devices import AsyncScalar, check_can_train, to_device
 from nsvq_lightning.compute.jit import check_threads
@@ -221,7 +221,7 @@ class SplatModule(LightningModule):
             pixel_weights: Strength of each pixel ``[H, W]``, see :func:`nsvq_lightning.render`.
         """
 
-        def draws(*salts: str) -> torch.Generator:
+        def draws(*salts: str) -> Generator:
             # It lives on the CPU: quantizers draw a seed from it. The 0 is a salt of before, which bits depend on.
             return generator(self.seed, self.global_step, 0, *salts, self._view_of_step)
 

@@ -5,8 +5,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import nn
+from torch.optim import Adam, Optimizer
 
 from nsvq_lightning.splats.attributes import ATTRIBUTES
 from nsvq_lightning.splats.splats import Splats
@@ -99,7 +99,7 @@ def group_lr(name: str, rates: LearningRates, extent: float) -> float:
     return rate * extent if name == "means" else rate
 
 
-def adapt_to_views(optimizer: torch.optim.Optimizer, rates: LearningRates, views: int) -> float:
+def adapt_to_views(optimizer: Optimizer, rates: LearningRates, views: int) -> float:
     """Set betas and epsilon of all groups, for example after a checkpoint has replaced them.
 
     With ``rates.scale_with_views``, for a step of B views with averaged gradients: √B·lr, 1 - B·(1 - β), ε / √B.
@@ -129,13 +129,13 @@ def adapt_to_views(optimizer: torch.optim.Optimizer, rates: LearningRates, views
     return math.sqrt(scale)
 
 
-def build_adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
+def build_adam(groups: list[dict[str, Any]]) -> Adam:
     """Adam of the paper over ``groups``: default betas, epsilon 1e-15, no weight decay; fused where torch can."""
     fused = all(group["params"][0].device.type in ("cpu", "cuda") for group in groups)
-    return torch.optim.Adam(groups, eps=EPS, fused=fused or None)
+    return Adam(groups, eps=EPS, fused=fused or None)
 
 
-def find_group(optimizer: torch.optim.Optimizer, name: str) -> dict[str, Any]:
+def find_group(optimizer: Optimizer, name: str) -> dict[str, Any]:
     """The parameter group ``name``.
 
     Raises:
@@ -147,7 +147,7 @@ def find_group(optimizer: torch.optim.Optimizer, name: str) -> dict[str, Any]:
     return groups[name]
 
 
-def check_groups(optimizers: Sequence[torch.optim.Optimizer], quantized: Iterable[str]) -> None:
+def check_groups(optimizers: Sequence[Optimizer], quantized: Iterable[str]) -> None:
     """Check that a module's optimiser has the groups that callbacks edit by name.
 
     Args:

@@ -14,11 +14,11 @@ Examples:
   nsvq benchmark quantize,codec --scene scene.ply
 """
 
-import argparse
-import importlib
 import logging
 import sys
 import time
+from argparse import ArgumentError, ArgumentParser, Namespace
+from importlib import import_module
 from pathlib import Path
 
 from nsvq_lightning.commands.arguments import integers, positive, some_of
@@ -38,7 +38,7 @@ SIZES = {
 }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add what ``nsvq benchmark`` takes."""
     help_ = f"of {', '.join(SUITES)}: one, some with commas between them, or all"
     parser.add_argument("suites", type=some_of(SUITES), metavar="SUITE", help=help_)
@@ -61,22 +61,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 QUICK = {"repeats": 3, "seconds": 0.5, "workloads": ("A20k",), "steps": 40}
 
 
-def run(options: argparse.Namespace) -> int:
+def run(options: Namespace) -> int:
     """Measure, and print the tables.
 
     Raises:
-        argparse.ArgumentError: Options do not go together, or a number is out of range.
+        ArgumentError: Options do not go together, or a number is out of range.
         ValueError: The scene cannot be used.
         OSError: A file cannot be read.
     """
     steps, scene = options.steps, options.scene
     # Arguments are refused before torch is loaded.
     if steps is not None and steps < 4:
-        raise argparse.ArgumentError(None, f"--steps must be at least 4, one for each phase, got {steps}")
+        raise ArgumentError(None, f"--steps must be at least 4, one for each phase, got {steps}")
     if options.emulate is not None and (min(options.emulate) < 1 or options.suites != ("train",)):
-        raise argparse.ArgumentError(None, "--emulate takes numbers of cores, and is for the suite train alone")
+        raise ArgumentError(None, "--emulate takes numbers of cores, and is for the suite train alone")
     if options.init_from is not None and not (scene is not None and scene.is_dir()):
-        raise argparse.ArgumentError(None, "--init-from needs a COLMAP folder as --scene, whose cameras see its splats")
+        raise ArgumentError(None, "--init-from needs a COLMAP folder as --scene, whose cameras see its splats")
     from nsvq_lightning.commands.benchmark.timing import Scope, as_markdown, describe_machine
 
     given = {name: value for name, value in vars(options).items() if name != "suites" and value is not None}
@@ -85,7 +85,7 @@ def run(options: argparse.Namespace) -> int:
     about = describe_machine()  # as busy as the machine is before
     found = {}
     for name in options.suites:
-        suite = importlib.import_module(f"{__package__}.{name}")
+        suite = import_module(f"{__package__}.{name}")
         start = time.perf_counter()
         found[name] = list(suite.run(scope))
         sys.stderr.write(f"{name}: {time.perf_counter() - start:.1f} s\n")

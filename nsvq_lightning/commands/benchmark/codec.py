@@ -1,9 +1,9 @@
 """Suite ``codec``: writing and reading scene files."""
 
-import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import torch
 
@@ -19,7 +19,7 @@ from nsvq_lightning.training.splat_scene import to_compressed
 def run(scope: Scope) -> Iterator[Measurement]:
     """Time writing and reading."""
     for workload in workloads(scope):
-        with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder:
+        with TemporaryDirectory(prefix="nsvq-benchmark-") as folder:
             yield from _file_rows(workload, scope, Path(folder))
 
 

@@ -7,10 +7,10 @@ above all memory, shows where one and two of them are compared with what one and
 """
 
 import ctypes
-import heapq
 import sys
 import time
 from collections.abc import Sequence
+from heapq import heapreplace
 from statistics import median
 
 import numpy as np
@@ -90,5 +90,5 @@ def makespan(seconds: Sequence[float], cores: int) -> float:
     """When the last of some cores is done, each of which takes the next part when it is done with one."""
     busy = [0.0] * cores
     for each in seconds:
-        heapq.heapreplace(busy, busy[0] + each)
+        heapreplace(busy, busy[0] + each)
     return max(busy)

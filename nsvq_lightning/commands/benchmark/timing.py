@@ -1,7 +1,6 @@
 """Fair times on a shared machine (what is compared takes turns, and a matrix product takes part), and their tables."""
 
 import gc
-import importlib.metadata
 import os
 import platform
 import re
@@ -9,6 +8,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -184,7 +184,7 @@ def describe_machine() -> list[str]:
     }
     packages = ("numpy", "torch", "numba", "llvmlite", "lightning", "torchmetrics", "jsonargparse", "scipy", "pycolmap")
     versions = {"nsvq-lightning": __version__, "python": platform.python_version()}
-    versions |= {name: importlib.metadata.version(name) for name in packages if find_spec(name)}
+    versions |= {name: version(name) for name in packages if find_spec(name)}
     return [_listed(machine), _listed(versions)]
 
 

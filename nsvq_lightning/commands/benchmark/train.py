@@ -6,14 +6,14 @@ same number of steps. Variants differ from the first one in one thing.
 """
 
 import logging
-import tempfile
 import time
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean, median
+from tempfile import TemporaryDirectory
 from typing import Any, cast
+from warnings import catch_warnings
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
@@ -140,7 +140,7 @@ def _train(scope: Scope, clock: StepClock) -> None:
         data.append(f"--model.init_from={scope.init_from}")
     logging.disable(logging.WARNING)  # of Lightning, about devices, loaders and the end of the run
     try:
-        with tempfile.TemporaryDirectory(prefix="nsvq-benchmark-") as folder, warnings.catch_warnings(action="ignore"):
+        with TemporaryDirectory(prefix="nsvq-benchmark-") as folder, catch_warnings(action="ignore"):
             arguments = [
                 "fit",
                 f"--config={find_config(_config(scope))}",
