@@ -206,7 +206,7 @@ def resized(image: Uint8s, kept: Bools | None, size: tuple[int, int]) -> tuple[U
     if image.shape[1::-1] == size:
         return image, kept
     if kept is not None:
-        kept = cv2.resize(kept.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255
+        kept = cv2.resize(kept.view(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) == 255
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA), kept
 
 

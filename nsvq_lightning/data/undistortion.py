@@ -85,7 +85,7 @@ class Undistortion:
         result[blank] = 0
         count = ~blank
         if kept is not None:
-            whole = kept.view(np.uint8) * np.uint8(255)
+            whole = kept.view(np.uint8) * 255
             count &= cv2.remap(whole, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) == 255
         return result, None if count.all() else count
 

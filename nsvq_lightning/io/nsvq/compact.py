@@ -142,12 +142,12 @@ def _workers() -> ThreadPoolExecutor:
 def _before(count: int) -> Int32s:
     """The two rows ``[N, 2]`` before each row, -1 where there is none."""
     rows = np.arange(count, dtype=np.int32)[:, None] - np.array([1, 2], np.int32)
-    return np.maximum(rows, np.int32(-1))
+    return np.maximum(rows, -1)
 
 
 def _neighbours(keys: Uint64s, depths: Int64s, count: int) -> Int32s:
     """Two near rows ``[N, 2]`` before each row; for the far splats, which come last, the two rows before."""
-    half = (np.int64(1) << (morton.AXIS_BITS - depths)) >> 1
+    half = (1 << (morton.AXIS_BITS - depths)) >> 1
     neighbours = _before(count)
     neighbours[: len(keys)] = morton.nearest_before(morton.unmorton(keys) + half[:, None])
     return neighbours
