@@ -280,8 +280,7 @@ class DensityControl(Densification):
         if self.max_splats is not None:
             ranks = torch.where(grown, statistic, -torch.inf)
             grown &= top_rows(ranks, max(0, self.max_splats - len(splats)))
-        chosen = grown & ~large, grown & large
-        clones, parents = (detached(splats).take(mask) for mask in chosen)
+        clones, parents = (detached(splats).take(grown & mask) for mask in (~large, large))
         children = split(parents, self.shrink, generator(module.seed, iteration, "split"))
         new = RawSplats(*map(torch.cat, zip(clones, children, strict=True)))
         return self.divide(module, grown & large, new)

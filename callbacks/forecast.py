@@ -99,8 +99,7 @@ def iterations_within(minutes: float, trainer: Trainer, module: SplatModule, sch
     scene = run_scene.needed_scene(trainer, "minutes are measured on the photos", "give trainer.max_steps")
     budget = module.splat_budget
     if budget is None:
-        usual = splats_for_photos(len(scene.train), detailed_pixels(scene))
-        parts = [(1.0, round(PAPER_SPLATS * usual))]
+        parts = [(1.0, round(PAPER_SPLATS * splats_for_photos(len(scene.train), detailed_pixels(scene))))]
     elif module.stretches is None:
         parts = [(1.0, budget)]
     else:

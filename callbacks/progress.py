@@ -61,9 +61,9 @@ class SplatProgressBar(TQDMProgressBar):
     def on_train_start(self, trainer: Trainer, *args: Any) -> None:
         """Start the bar at the current iteration."""
         super().on_train_start(trainer, *args)
-        done = trainer.global_step
-        self.train_progress_bar.reset(total=self.total_train_batches)
-        self.train_progress_bar.initial = self.train_progress_bar.n = done  # (n - initial) / time is the speed
+        bar = self.train_progress_bar
+        bar.reset(total=self.total_train_batches)
+        bar.initial = bar.n = trainer.global_step  # (n - initial) / time is the speed
         self._start = time.time() - compile_seconds()
 
     def on_train_epoch_start(self, trainer: Trainer, *args: Any) -> None:
@@ -82,8 +82,7 @@ class SplatProgressBar(TQDMProgressBar):
             left = seconds * (total - done) / max(1.0, done - self.train_progress_bar.initial)
             end = time.strftime("%H:%M", time.localtime(time.time() + left))
             times = f"{Tqdm.format_interval(seconds)} elapsed, {Tqdm.format_interval(left)} left, until {end}"
-            progress = f"iteration {done} of {total} ({100 * done // total} %), {times}"
-            sys.stdout.write(f"{progress}: {text}\n")
+            sys.stdout.write(f"iteration {done} of {total} ({100 * done // total} %), {times}: {text}\n")
             sys.stdout.flush()
             return
         bar = self.train_progress_bar

@@ -48,8 +48,7 @@ def unknown_option(message: str, options: Iterable[str]) -> str:
 
 def names(text: str) -> tuple[str, ...]:
     """The entries of ``A,B``, each once; an empty one if there is none."""
-    entries = (part.strip() for part in text.split(","))
-    return tuple(dict.fromkeys(filter(None, entries))) or ("",)
+    return tuple(dict.fromkeys(filter(None, map(str.strip, text.split(","))))) or ("",)
 
 
 def some_of(known: Iterable[str]) -> Callable[[str], tuple[str, ...]]:

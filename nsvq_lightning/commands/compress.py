@@ -51,8 +51,7 @@ def splats_left(asked: int | float | None, count: int) -> int:
     """How many of ``count`` splats a result of :func:`share_or_number` leaves; all if it is None."""
     if asked is None:
         return count
-    number = asked if isinstance(asked, int) else round(asked * count)
-    return min(count, max(1, number))
+    return min(count, max(1, asked if isinstance(asked, int) else round(asked * count)))
 
 
 def written_error(measure: "Measure", error: float, original: str) -> str:

@@ -352,10 +352,9 @@ def check_budget(scene: "Scene") -> Iterator[Finding]:
     fast = check_config(find_config("fast"))
     phases = PhaseSchedule(**fast["callbacks"]["phases"])
     wanted = SplatBudget(**fast["callbacks"]["budget"])
-    growth = BudgetedGrowth()
     budget = splats_for_photos(len(scene.train), detailed_pixels(scene), wanted.quality)
     steps = phases.limited(fast["trainer"]["max_steps"], len(scene.train))
-    parts = growth.stretches(phases.schedule(steps), round(wanted.start * budget), budget)
+    parts = BudgetedGrowth().stretches(phases.schedule(steps), round(wanted.start * budget), budget)
     minutes = steps * iteration_seconds(scene, parts, best_device()) / 60
     yield Finding("good", "run time", f"about {minutes:.0f} min for fast.yaml, on a machine as busy as now")
 

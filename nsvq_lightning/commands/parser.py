@@ -184,8 +184,7 @@ def _options(parser: LightningArgumentParser) -> Iterator[Option]:
         name = (action.option_strings or [""])[-1].lstrip("-").removesuffix("+")
         if name and not name.endswith(".help"):
             required = action.default == SUPPRESS or action.required
-            default = "" if required else _default(defaults.get(action.dest))
-            yield Option(name, default, first_sentence(action.help))
+            yield Option(name, "" if required else _default(defaults.get(action.dest)), first_sentence(action.help))
 
 
 def _default(value: Any) -> str:

@@ -91,8 +91,7 @@ def run(options: Namespace) -> int:
     scene, known, _ = scene_with_views(read_scene(file), file, options.root)
     splats = scene.decode()
     cameras, fps = _path(options, splats, known, is_video)
-    device = best_device()
-    raw = splats.to(device).raw()
+    raw = splats.to(best_device()).raw()
     look = partial(
         render,
         background=options.background or scene.background,

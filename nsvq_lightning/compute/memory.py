@@ -107,9 +107,8 @@ class Workspace:
         """One-dimensional array of ``size`` elements, aligned to a cache line."""
         held = self._arrays.get(name)
         if held is None or held.size < size:
-            room = size + size // 4
             # torch aligns to 64 bytes, NumPy only to 16.
-            memory = torch.empty(max(1, room) * np.dtype(dtype).itemsize, dtype=torch.uint8).numpy()
+            memory = torch.empty(max(1, size + size // 4) * np.dtype(dtype).itemsize, dtype=torch.uint8).numpy()
             held = self._arrays[name] = memory.view(dtype)
         return held[:size]
 

@@ -188,8 +188,7 @@ def _point_record(data: mmap.mmap, start: int, tracks: bool) -> tuple[_Point, in
     end = first + 8 * length
     if end > len(data) or not tracks:
         return tuple(values), end
-    images = struct.unpack_from(f"<{2 * length}I", data, first)[::2]
-    return (*values, *images), end
+    return (*values, *struct.unpack_from(f"<{2 * length}I", data, first)[::2]), end
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:

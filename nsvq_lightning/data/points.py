@@ -95,9 +95,7 @@ def random_points(cameras: list[Camera]) -> Float64s:
     across, down, away = torch.rand(3, count, generator=draws, dtype=torch.float64).numpy()
     fx, fy, cx, cy = np.array([camera.intrinsics for camera in cameras])[chosen].T
     width, height = np.array([camera.size for camera in cameras])[chosen].T
-    x = (across * width - cx) / fx
-    y = (down * height - cy) / fy
-    rays = np.c_[x, y, np.ones(count)]
+    rays = np.c_[(across * width - cx) / fx, (down * height - cy) / fy, np.ones(count)]
     points = centres[chosen] + rotations[chosen].apply(rays * (2 * distance * away)[:, None])
     # One after another: all pictures at once would take a byte for each point and camera.
     sightings = sum(in_picture(points, camera).astype(int) for camera in cameras)

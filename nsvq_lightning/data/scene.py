@@ -295,8 +295,7 @@ def load_scene(
         )
     mask_files: list[Path | None] = [None] * len(views)
     if masks is not None:
-        mask_folders = [f"{masks}_{factor}", masks] if factor else [masks]
-        mask_files = find_masks(poses.images, files, folder, root, mask_folders)
+        mask_files = find_masks(poses.images, files, folder, root, [f"{masks}_{factor}", masks] if factor else [masks])
     sources = _image_sources(poses, files, mask_files, divisor, max_width if factor is None else None)
     poses, frame = _framed(poses, root, origin)
     cameras = tuple(_camera(image, source.pinhole, frame) for image, source in zip(poses.images, sources, strict=True))

@@ -294,8 +294,7 @@ def _frames(file: Path, allow_outside: bool) -> tuple[Json, dict[str, _Frame]]:
         # Its own angle comes before a focal length of the file.
         angle = any(key.startswith("camera_angle_") for key in own)
         common = {key: value for key, value in shared.items() if not (angle and key.startswith("fl_"))}
-        values = {key: value for key, value in (common | own).items() if value is not None}
-        frame = _Frame(file, position, values)
+        frame = _Frame(file, position, {key: value for key, value in (common | own).items() if value is not None})
         if not frame.path("file_path"):
             raise frame.error("has no file_path")
         given.append(frame)
@@ -355,8 +354,7 @@ def _points(
     views = []
     for image in images:
         lens = cameras[image.camera_id]
-        view = torch.from_numpy(image.viewmat)
-        views.append(Camera(lens.calibration_matrix(), view, lens.width, lens.height))
+        views.append(Camera(lens.calibration_matrix(), torch.from_numpy(image.viewmat), lens.width, lens.height))
     moved = transformed(points, applied)
     if share_seen(moved, views) > 1.5 * share_seen(points, views):
         log.info("%s: the points are not in the frame of the cameras: applied_transform moves them there", path)

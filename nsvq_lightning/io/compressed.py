@@ -360,8 +360,7 @@ class CompressedScene:
         if degree == 0 or "shN" in self.bases:  # no codebook at degree 0, nor a basis of another width
             codes = {name: codes for name, codes in self.codes.items() if name != "shN"}
             codebooks = {name: self.codebooks[name] for name in codes}
-            raw = {**self.raw, "shN": self.rows("shN")}
-            scene = replace(self, codes=codes, codebooks=codebooks, raw=raw, bases={})
+            scene = replace(self, codes=codes, codebooks=codebooks, raw={**self.raw, "shN": self.rows("shN")}, bases={})
         fitted = {"shN": lambda rows: np.pad(rows[:, :width], ((0, 0), (0, max(0, width - rows.shape[1]))))}
         return scene.changed(fitted, sh_degree=degree)
 

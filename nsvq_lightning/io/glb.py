@@ -155,8 +155,7 @@ def _parsed(data: bytes) -> tuple[Json, memoryview]:
 def _primitives(document: Json) -> Iterator[tuple[Json, Float64s]]:
     """Those with splats, and the matrix ``[4, 4]`` of the node that each is in."""
     nodes = document["nodes"]
-    roots = document["scenes"][document.get("scene", 0)]["nodes"]
-    stack = [(number, np.eye(4)) for number in reversed(roots)]
+    stack = [(number, np.eye(4)) for number in reversed(document["scenes"][document.get("scene", 0)]["nodes"])]
     steps = 0
     while stack:
         number, outer = stack.pop()

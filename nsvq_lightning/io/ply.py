@@ -465,8 +465,7 @@ def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
 
 def _packed_part(scene: CompressedScene, clamped: Clamped) -> dict[str, NDArray[np.void]]:
     """The elements of a part that begins with a chunk."""
-    colors = 0.5 + SH_C0 * scene.rows("sh0")
-    values = np.stack([scene.means, scene.rows("scales").clip(-20, 20), colors], axis=1)
+    values = np.stack([scene.means, scene.rows("scales").clip(-20, 20), 0.5 + SH_C0 * scene.rows("sh0")], axis=1)
     starts = np.arange(0, len(scene), _CHUNK)
     bounds = np.stack([each.reduceat(values, starts) for each in (np.minimum, np.maximum)], axis=2)
     low, high = np.moveaxis(_for_each(bounds, len(scene)), 2, 0)

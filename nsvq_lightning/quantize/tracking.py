@@ -174,8 +174,7 @@ class NearestTracker:
             self._snapshot, self._memory = codebook.copy(), _blank_memory(0, dim)
         more = count - len(self._memory[0])
         if more > 0:
-            both = zip(self._memory, _blank_memory(more, dim), strict=True)
-            self._memory = tuple(map(np.concatenate, both))
+            self._memory = tuple(map(np.concatenate, zip(self._memory, _blank_memory(more, dim), strict=True)))
 
     def _search_boxes(self, x: Array, codebook: Array, rows: Array) -> Array:
         if self._steps % 64 == 0 or self._order is None:  # boxes in an old order are larger

@@ -54,8 +54,7 @@ class Frame:
 
     def relative_to(self, origin: Place) -> "Frame":
         """The same coordinates of files whose positions are relative to another origin."""
-        middle = np.add(self.middle, np.subtract(self.origin, origin))
-        return Frame(self.unit, tuple(middle.tolist()), origin)
+        return Frame(self.unit, tuple(np.add(self.middle, np.subtract(self.origin, origin)).tolist()), origin)
 
     @property
     def near(self) -> float:

@@ -113,10 +113,7 @@ def _views(folder: Path, views: Rows) -> str:
 
 def _curve(history: Rows, schedule: Schedule) -> str:
     """What ``report.js`` draws."""
-    rows = []
-    for entry in history:
-        psnr = entry["psnr"] if math.isfinite(entry["psnr"]) else None
-        rows.append([entry["iteration"], psnr, entry["splats"]])
+    rows = [[row["iteration"], row["psnr"] if math.isfinite(row["psnr"]) else None, row["splats"]] for row in history]
     phases = [[phase.name.lower(), end] for phase, end in zip(Phase, schedule.ends, strict=False)]
     data = script_json({"history": rows, "phases": phases})
     return f'<div id="curve" class="card"></div><script>const trained = {data};</script>'

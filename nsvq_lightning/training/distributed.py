@@ -38,8 +38,7 @@ def check_strategy(strategy: Strategy) -> None:
 def follow_first(strategy: Strategy, module: nn.Module) -> None:
     """Copy the first process's parameters and buffers to the module on every process; row counts may differ before."""
     # What is pickled on a GPU would come back on the first process's.
-    own = {name: tensor.cpu() for name, tensor in module.state_dict().items()}
-    module.load_state_dict(strategy.broadcast(own))
+    module.load_state_dict(strategy.broadcast({name: tensor.cpu() for name, tensor in module.state_dict().items()}))
 
 
 @torch.no_grad()

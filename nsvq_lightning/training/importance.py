@@ -141,8 +141,7 @@ def floaters(splats: SplatTensors, views: Callable[[], Iterable[View]], render: 
     mask = torch.ones_like(left, dtype=torch.bool)
     threshold = torch.inf
     for number in range(12):
-        rest = raw.take(left)
-        slope, curvature, error = removal_effects(rest, views(), render, generator(0, number, "floaters"))
+        slope, curvature, error = removal_effects(raw.take(left), views(), render, generator(0, number, "floaters"))
         # Of a floater's opacity, the photos want at most a third; 0 of one in front of a finished scene.
         gain = torch.where(slope < 2 * (1 / 3 - 1) * curvature, -slope - curvature, 0)
         # A gain below this share of the squared error is not seen, and is noise.

@@ -91,8 +91,7 @@ def change_coordinates(splats: Splats, optimizer: Optimizer, name: str, values: 
         raise ValueError(f"maps of {name} must be {[*values.shape, values.shape[-1]]}, got {list(maps.shape)}")
     replace_attribute(splats, name, values)
     for key, moment in _moments(optimizer, name).items():
-        factors = maps if key in FIRST_MOMENTS else maps.square()
-        moment.copy_(times_vectors(factors, moment))
+        moment.copy_(times_vectors(maps if key in FIRST_MOMENTS else maps.square(), moment))
 
 
 def reset_moments(optimizer: Optimizer, name: str, rows: Tensor | None = None) -> None:

@@ -56,8 +56,7 @@ def _step(backend: str, device: str, dtype: torch.dtype) -> dict[str, Tensor]:
     made["scales"] -= 2.5
     photo, codebook = torch.rand(72, 96, 3, generator=draw), torch.randn(100, 4, generator=draw).to(device, dtype)
     splats = RawSplats(**{name: value.to(device, dtype).requires_grad_() for name, value in made.items()})
-    camera = camera_of(torch.eye(4), (80, 80, 48, 36), 96, 72)
-    image = render(splats, camera, backend=backend).image
+    image = render(splats, camera_of(torch.eye(4), (80, 80, 48, 36), 96, 72), backend=backend).image
     loss = photometric_loss(image, photo.to(device, dtype))
     loss.backward()  # type: ignore[no-untyped-call]
     quats, codebook = splats.quats.detach(), codebook.requires_grad_()
@@ -65,11 +64,10 @@ def _step(backend: str, device: str, dtype: torch.dtype) -> dict[str, Tensor]:
     found = lookup(codebook, codes)
     (found**2).sum().backward()  # type: ignore[no-untyped-call]
     substituted = noise_substitution(quats, codebook, codes, draw)
-    gradients = {name: tensor.grad for name, tensor in splats._asdict().items()}
     return {
         "image": image,
         "loss": loss,
-        **gradients,
+        **{name: tensor.grad for name, tensor in splats._asdict().items()},
         "codes": (quats - found).norm(dim=1),
         "noise": (substituted - quats).norm(dim=1),  # as long as the error
         "codebook": codebook.grad,

@@ -200,6 +200,4 @@ def run(scope: Scope) -> Iterator[Measurement]:
 @torch.no_grad()
 def _test_psnr(module: SplatModule) -> float:
     data: ColmapDataModule = module.trainer.datamodule  # type: ignore[attr-defined]  # Lightning does not type it
-    splats = module.scene.hard_splats(module.phase)
-    psnr, _ = evaluate(module.scene.render, splats, data.test_dataloader())
-    return psnr
+    return evaluate(module.scene.render, module.scene.hard_splats(module.phase), data.test_dataloader())[0]

@@ -311,8 +311,7 @@ class DeviceTracker:
         result = torch.empty_like(rows)
         more = len(x) - len(self._memory[0])
         if more > 0:
-            both = zip(self._memory, empty_memory(more, dim, device), strict=True)
-            self._memory = tuple(map(torch.cat, both))
+            self._memory = tuple(map(torch.cat, zip(self._memory, empty_memory(more, dim, device), strict=True)))
         if count == 0:
             return result
         searched, queue = rows.new_empty(2, count, dtype=torch.int32)
