@@ -253,8 +253,7 @@ class BudgetedGrowth(Densification):
         if self.is_due(module, iteration):
             self._split_and_prune(module, iteration)
         photos = getattr(run_scene.scene_of(trainer), "train", ())
-        last = self.reset_last * (len(photos) >= self.reset_photos)
-        resets = schedule.reset_times(last, self.reset_every)
+        resets = schedule.reset_times(self.reset_last * (len(photos) >= self.reset_photos), self.reset_every)
         if iteration in resets:
             reset_opacities(module, self.reset_opacity)
         if iteration in (reset + schedule.interval(self.recovery) for reset in resets):
@@ -292,8 +291,7 @@ class BudgetedGrowth(Densification):
         progress = min(max((reference - self.start) / (self.full - self.start), 0.0), 1.0)
         room = int(self.limit(module) * math.sqrt(progress)) - len(splats)
         divided = draw_rows(candidates, room, generator(module.seed, iteration, "grow"))
-        parents = detached(splats).take(divided)
-        return room, self.divide(module, divided, split_longest(parents))
+        return room, self.divide(module, divided, split_longest(detached(splats).take(divided)))
 
 
 def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:

@@ -73,8 +73,7 @@ def standard(config: str | None = None, /, **replaced: Callback | None) -> list[
         >>> [type(callback).__name__ for callback in few[:2]]
         ['SplatBudget', 'PhaseSchedule']
     """
-    unknown = sorted(set(replaced) - set(STANDARD))
-    if unknown:
+    if unknown := sorted(set(replaced) - set(STANDARD)):
         raise ValueError(f"there is no standard callback {', '.join(unknown)}; there are {', '.join(STANDARD)}")
     configs = {path.stem: path for path in folder_of("configs").glob("*.yaml")}
     if config not in (None, *configs):

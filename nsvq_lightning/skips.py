@@ -32,8 +32,7 @@ def switched(**switches: bool) -> Iterator[None]:
     Raises:
         ValueError: There is no such switch.
     """
-    unknown = sorted(set(switches) - set(SKIPS))
-    if unknown:
+    if unknown := sorted(set(switches) - set(SKIPS)):
         raise ValueError(f"unknown switches {', '.join(unknown)}; there are {', '.join(SKIPS)}")
     before = dict(_ON)
     try:

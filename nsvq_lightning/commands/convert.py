@@ -68,8 +68,7 @@ def run(options: Namespace) -> int:
         ValueError: A file cannot be understood, or nothing is left of the scene.
         OSError: A file cannot be read or written.
     """
-    wrong = _contradiction(options)
-    if wrong:
+    if wrong := _contradiction(options):
         raise ArgumentError(None, wrong)
     output = options.output
     # Now, not after the minutes that floaters take.

@@ -300,8 +300,7 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
             yield Finding("problem", "poses", f"{text}: are poses camera to world, or quaternions xyzw?")
     cameras = [model.cameras[image.camera_id] for image in model.images]
     pairs = zip(cameras, scene.images.sources, strict=True)
-    others = sum(not same_shape(source.size, (camera.width, camera.height)) for camera, source in pairs)
-    if others:
+    if others := sum(not same_shape(source.size, (camera.width, camera.height)) for camera, source in pairs):
         yield Finding("problem", "sizes", f"{others} of {len(scene)} files {OTHER_SHAPE}")
     yield from attempt("photos", check_photos(scene, model))
     yield from attempt("run time", check_budget(scene))
@@ -334,8 +333,7 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
     if folder == scene.root.absolute():
         return  # that of a NeRF-synthetic scene, which also holds maps and further views
     files = photos_below(folder)
-    extra = set(files).difference(source.path for source in scene.images.sources)
-    if extra:
+    if extra := set(files).difference(source.path for source in scene.images.sources):
         text = f"{len(extra)} of {len(files)} files in {folder} are not in the model"
         advice = "they are not used; if many, photos lack overlap or sharpness"
         yield Finding("note", "registered", f"{text}: {advice}")

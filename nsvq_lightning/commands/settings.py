@@ -116,8 +116,7 @@ def check_early(arguments: Sequence[str]) -> None:
 
 def _check_options(options: Sequence[str], own: Mapping[str, str], other_data: bool) -> None:
     """Refuse options that ``fit`` does not have."""
-    stray = [option for option in options if not option.startswith("--")]
-    if stray:
+    if stray := [option for option in options if not option.startswith("--")]:
         place = next((option for option in stray if Path(option).exists()), "path/to/scene")
         raise ArgumentError(None, f"{stray[0]} is no option; the scene folder is --data.root={place}")
     if any(version(name) != known for name, known in FIT_HELP_OF.items()):

@@ -216,8 +216,7 @@ class Compressor:
         precision = self.storage.precision
         if times > 1:
             names = plain or ["position", "opacity"]
-            coarser = {name: float(f"{times * getattr(precision, name):.3g}") for name in names}
-            precision = replace(precision, **coarser)
+            precision = replace(precision, **{name: float(f"{times * getattr(precision, name):.3g}") for name in names})
         return Candidate(setting, b"".join(frame(*encode(scene, replace(self.storage, precision=precision)))))
 
     def _row_weights(self, setting: Setting) -> Tensor:
@@ -417,8 +416,7 @@ class Compressor:
         trim()
         try:
             with catch_warnings(action="ignore"):
-                trainer = SplatTrainer(max_steps=steps, callbacks=callbacks, enable_checkpointing=False)
-                trainer.fit(module, self.data)
+                SplatTrainer(max_steps=steps, callbacks=callbacks, enable_checkpointing=False).fit(module, self.data)
         except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
             if module.phase < Phase.QUANTIZE or not all(getattr(q, "fitted", True) for q in module.quantizers.values()):
                 raise KeyboardInterrupt from None

@@ -181,8 +181,7 @@ def find_masks(
         SceneError: A mask that the model names does not exist, or two files fit a photo.
     """
     given = [image.mask for image in images]
-    lost = [path for path in given if path is not None and not path.is_file()]
-    if lost:
+    if lost := [path for path in given if path is not None and not path.is_file()]:
         raise SceneError(f"{len(lost)} masks do not exist, first {lost[0]}: copy them, or remove mask_path")
     relative = [str(path.relative_to(photos)) if path.is_relative_to(photos) else path.name for path in files]
     named = [(image.name, name) for image, name in zip(images, relative, strict=True)]

@@ -287,8 +287,7 @@ def load_scene(
     folder, divisor = photo_folder(root, images_folder, factor, names)
     found = locate(names, folder, f"the {poses.source} model of {root}", allow_outside)
     files = [found[name] for name in names]
-    lost = [name for name in names if not found[name].is_file()]
-    if lost:
+    if lost := [name for name in names if not found[name].is_file()]:
         raise (NoPhotosError if len(lost) == len(names) else SceneError)(
             f"{len(lost)} of {len(names)} images of the model are not in {folder}, first {lost[0]}: "
             "copy the photos that COLMAP was run on into that folder, under the same names"
@@ -486,8 +485,7 @@ def usable(scene: Scene) -> Scene:
     Raises:
         SceneError: No train or no test view is left.
     """
-    wrong = {index: error for index, error in enumerate(each_photo(scene, lambda _: None)) if error}
-    if wrong:
+    if wrong := {index: error for index, error in enumerate(each_photo(scene, lambda _: None)) if error}:
         first = next(iter(wrong.values()))
         train, test = (tuple(view for view in views if view not in wrong) for views in (scene.train, scene.test))
         if not train or not test:

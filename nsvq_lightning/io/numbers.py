@@ -85,8 +85,7 @@ class Clamped(Counter[str]):
 
     def warn(self, path: StrPath, count: int) -> None:
         """Warn how many of ``count`` splats were clamped to the format's range."""
-        changed = ", ".join(f"{name} {splats}" for name, splats in self.items() if splats)
-        if changed:
+        if changed := ", ".join(f"{name} {splats}" for name, splats in self.items() if splats):
             logger.warning(f"{path}: out of the range of its format, clamped to it: {changed} (of {count} splats)")
 
 

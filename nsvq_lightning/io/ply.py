@@ -226,8 +226,7 @@ def splat_degree(header: PlyHeader) -> int:
         names = header.others["sh"].properties if "sh" in header.others else ()
     else:
         names = header.properties
-        missing = [name for columns in _needed(header, 0).values() for name in columns if name not in names]
-        if missing:
+        if missing := [name for columns in _needed(header, 0).values() for name in columns if name not in names]:
             raise FormatError(f"not a .ply of Gaussian splats: it has no property {', '.join(missing)}")
     rest = [name for name in names if name.startswith("f_rest_")]
     strange = sorted({*rest} - {f"f_rest_{i}" for i in range(len(rest))})

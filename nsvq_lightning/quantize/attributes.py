@@ -27,8 +27,7 @@ def build_quantizers(
         TypeError: What ``quantizer`` makes does not implement :class:`~nsvq_lightning.quantize.codebook.Quantizer`.
     """
     sizes = codebook_sizes(codebooks) if isinstance(codebooks, str) else dict(codebooks or {})
-    unknown = sorted(set(sizes) - set(QUANTIZED))
-    if unknown:
+    if unknown := sorted(set(sizes) - set(QUANTIZED)):
         raise ValueError(f"codebooks: unknown attributes {', '.join(unknown)}; choose from {', '.join(QUANTIZED)}")
     built = {}
     for name in QUANTIZED:

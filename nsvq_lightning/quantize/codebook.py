@@ -380,8 +380,7 @@ def as_quantizer(module: object) -> Quantizer:
     """
     # Not by isinstance: since Python 3.12 it misses parameters and buffers, which an nn.Module gives by `__getattr__`.
     members = {name for name in (*Quantizer.__annotations__, *vars(Quantizer)) if not name.startswith("_")}
-    lacks = sorted(name for name in members if not hasattr(module, name))
-    if lacks:
+    if lacks := sorted(name for name in members if not hasattr(module, name)):
         raise TypeError(
             f"{type(module).__name__} is not a quantizer; it lacks: {', '.join(lacks)}; derive it from "
             "nsvq_lightning.quantize.CodebookQuantizer, or offer the members of nsvq_lightning.quantize.Quantizer"

@@ -125,8 +125,7 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
         file = Path(folder) / f"video{VIDEO}"
         first = file.with_suffix(".avi") if program else file  # from which ffmpeg makes the other
         code = "FFV1" if program else "vp09"
-        fourcc = cv2.VideoWriter.fourcc(*code)
-        video = cv2.VideoWriter(str(first), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
+        video = cv2.VideoWriter(str(first), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*code), fps, (width, height))
         if not video.isOpened():
             raise OSError(f"OpenCV cannot write {code} here: write PNGs into a folder")
         frames = []

@@ -69,8 +69,7 @@ def check_replicas(trainer: Trainer, event: str) -> None:
     parameters: dict[str, Tensor] = {group["name"]: group["params"][0] for group in trainer.optimizers[0].param_groups}
     own = torch.stack([checksum(parameter) for parameter in parameters.values()])
     differ = sum_over_processes(trainer, (own != from_first_process(trainer, own)).long())
-    different = [name for name, processes in zip(parameters, differ.tolist(), strict=True) if processes]
-    if different:
+    if different := [name for name, processes in zip(parameters, differ.tolist(), strict=True) if processes]:
         raise RuntimeError(
             f"iteration {trainer.global_step}, after {event}: the replicas of {trainer.world_size} processes differ in "
             f"{', '.join(different)}. A decision used data of one process alone, or the machines compute "

@@ -55,8 +55,7 @@ def keep_rows(splats: Splats, optimizer: Optimizer, mask: Tensor) -> None:
         raise ValueError(f"mask must be [{len(splats)}] bool, got {list(mask.shape)} {mask.dtype}")
     rows = mask.nonzero()[:, 0]
     if len(rows) < len(splats):
-        values = (numbers[rows] for numbers in _one_by_one(splats))
-        _rebind(splats, optimizer, values, lambda numbers: numbers[rows])
+        _rebind(splats, optimizer, (numbers[rows] for numbers in _one_by_one(splats)), lambda numbers: numbers[rows])
 
 
 def replace_attribute(splats: Splats, name: str, values: Tensor) -> None:

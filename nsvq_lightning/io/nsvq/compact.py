@@ -141,8 +141,7 @@ def _workers() -> ThreadPoolExecutor:
 
 def _before(count: int) -> Int32s:
     """The two rows ``[N, 2]`` before each row, -1 where there is none."""
-    rows = np.arange(count, dtype=np.int32)[:, None] - np.array([1, 2], np.int32)
-    return np.maximum(rows, -1)
+    return np.maximum(np.arange(count, dtype=np.int32)[:, None] - np.array([1, 2], np.int32), -1)
 
 
 def _neighbours(keys: Uint64s, depths: Int64s, count: int) -> Int32s:

@@ -155,8 +155,7 @@ def encode_integers(values: Integers, order: Int64s | None = None) -> bytes:
     # Differences of differences are to be below 2^53, too.
     modes = bits[: _MODES if largest < _TOO_LARGE >> 1 else 2].argmin(0).astype(np.uint8)
     words = _room(bits.min(0).sum() + 8 * values.size)
-    contexts = rc.new_contexts(_INTEGER_CONTEXTS * values.shape[1])
-    used = _write_integers(values, order, modes, words, contexts)
+    used = _write_integers(values, order, modes, words, rc.new_contexts(_INTEGER_CONTEXTS * values.shape[1]))
     return bytes(modes) + _bytes(words, used)
 
 

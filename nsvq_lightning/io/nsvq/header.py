@@ -240,8 +240,7 @@ def _rounded(cameras: Float64s) -> tuple[tuple[float, ...], ...]:
     """Cameras ``[C, 4]`` with the digits that count: positions to about a hundredth of their spread."""
     if len(cameras) == 0:
         return ()
-    spread = np.ptp(cameras[:, :3], axis=0).max() or 1e-6
-    decimals = 2 - math.floor(math.log10(spread))
+    decimals = 2 - math.floor(math.log10(np.ptp(cameras[:, :3], axis=0).max() or 1e-6))
     return tuple((*(round(x, decimals) for x in place), float(f"{focal:.4g}")) for *place, focal in cameras.tolist())
 
 

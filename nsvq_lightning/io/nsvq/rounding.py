@@ -76,8 +76,7 @@ def _coded(name: str, codes: Integers, codebook: Float32s, error: float) -> Stor
     rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
     directions = unit(rows).astype(np.float32) if name == "quats" else rows
     distinct = np.unique(directions, axis=0)
-    distance = sibling_distance(distinct[tree_order(distinct)])
-    step = _step(rows, 2 * error * distance or 2.0**-16)
+    step = _step(rows, 2 * error * sibling_distance(distinct[tree_order(distinct)]) or 2.0**-16)
     integers, merged = np.unique(_integers(name, rows, step), axis=0, return_inverse=True)
     merged_codes = merged.ravel()[np.cumsum(used)[codes] - 1]
     order = tree_order((integers * step).astype(np.float32))
@@ -177,8 +176,7 @@ def sibling_distance(ordered: Float32s) -> float:
     dense, and so how exactly they must be stored.
     """
     differences = np.diff(ordered.astype(np.float64), axis=0)[::2]
-    distances = np.sqrt((differences**2).mean(1))
-    return float(np.median(distances)) if differences.size else 0.0
+    return float(np.median(np.sqrt((differences**2).mean(1)))) if differences.size else 0.0
 
 
 # Power-iteration steps for the direction of a cut. It need not be exact: 12 would save another 0.02 % of a file.
