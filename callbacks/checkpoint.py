@@ -2,10 +2,10 @@
 
 import logging
 import signal
-import threading
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from threading import current_thread, main_thread
 from types import FrameType
 from typing import Any
 
@@ -46,7 +46,7 @@ class GracefulStop:
     def hold(self, trainer: Trainer) -> None:
         """Start to hold signals back."""
         self._several = trainer.world_size > 1
-        if self._handlers or threading.current_thread() is not threading.main_thread():
+        if self._handlers or current_thread() is not main_thread():
             return
         for number in HELD:
             handler = signal.getsignal(number)

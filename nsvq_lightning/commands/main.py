@@ -1,7 +1,6 @@
 """The ``nsvq`` command. Kept light: ``nsvq info`` must answer without importing torch."""
 
 import gc
-import io
 import logging
 import os
 import re
@@ -13,6 +12,7 @@ from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from inspect import cleandoc
+from io import TextIOWrapper
 from traceback import walk_tb
 from typing import Any, TextIO
 
@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     # A pipe, too, shows lines as they come; on Windows it accepts only the locale's characters.
-    if isinstance(sys.stdout, io.TextIOWrapper):
+    if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="replace", line_buffering=True)
     try:
         if name in OF_LIGHTNING or name.startswith("-"):

@@ -11,10 +11,10 @@ Examples:
 """
 
 import shlex
-import shutil
 import sys
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
+from shutil import rmtree
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import READ, positive
@@ -63,7 +63,7 @@ def run(options: Namespace) -> int:
     try:
         counts = write_blocks(scene, blocks, folders)
     except BaseException:
-        shutil.rmtree(options.output)  # so that the command can be given again
+        rmtree(options.output)  # so that the command can be given again
         raise
     for folder, (train, test) in zip(folders, counts, strict=True):
         sys.stderr.write(f"{folder}: {train} train and {test} test photos\n")

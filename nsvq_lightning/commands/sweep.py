@@ -8,12 +8,10 @@ Examples:
   nsvq sweep --scenes fox,horns --configs paper,plain,own.yaml --output sweeps/own
 """
 
-import io
 import json
 import logging
 import re
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -21,8 +19,10 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from hashlib import sha256
+from io import StringIO
 from itertools import product
 from pathlib import Path
+from shutil import rmtree
 from typing import Any, NamedTuple
 from warnings import catch_warnings
 
@@ -193,7 +193,7 @@ def resolve(arguments: Sequence[str]) -> str:
     """
     from nsvq_lightning.commands.fit import SplatCLI
 
-    printed = io.StringIO()
+    printed = StringIO()
     with catch_warnings(action="ignore"), redirect_stdout(printed):
         try:
             SplatCLI(["fit", *expand(arguments), "--print_config"])
@@ -222,7 +222,7 @@ def prepare(run: Run) -> list[str]:
         begun = (run.folder / CHECKPOINT).is_file()
         if not begun:
             for path in map(run.folder.joinpath, RUN_FILES):
-                shutil.rmtree(path, ignore_errors=True)
+                rmtree(path, ignore_errors=True)
                 path.unlink(missing_ok=True)
         config = run.folder / "config.yaml"
         write_text(config, run.config)
@@ -306,7 +306,7 @@ def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> 
         if error:
             failed[run.folder] = error
         elif not keep_checkpoints:  # they are larger than everything else
-            shutil.rmtree(run.folder / CHECKPOINT.parent, ignore_errors=True)
+            rmtree(run.folder / CHECKPOINT.parent, ignore_errors=True)
         log.info("[%d/%d] %s: %s", number, len(runs), run.folder.name, error or "finished")
         known = [each for each in runs if each.is_finished or each.folder in failed]
         rows = [row_of(each, failed.get(each.folder, "")) for each in known]

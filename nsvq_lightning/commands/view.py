@@ -7,17 +7,17 @@ Examples:
   nsvq view scene.nsvq -o scene.html            one file to send to somebody, no server
 """
 
-import io
 import os
-import shutil
 import sys
 import webbrowser
 from argparse import ArgumentError, ArgumentParser, Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from io import BytesIO
 from ipaddress import ip_address
 from pathlib import Path
+from shutil import copyfileobj
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -186,7 +186,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
         # A slow client has the whole timeout for each part.
-        shutil.copyfileobj(io.BytesIO(content), self.wfile, 1 << 16)
+        copyfileobj(BytesIO(content), self.wfile, 1 << 16)
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing of each request."""

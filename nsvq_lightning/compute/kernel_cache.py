@@ -7,12 +7,12 @@ still Numba's own, lie in a folder named after a digest of the sources of a kern
 
 import logging
 import re
-import shutil
 import sys
 from functools import cache
 from hashlib import sha256
 from importlib.util import resolve_name
 from pathlib import Path
+from shutil import rmtree
 from tempfile import TemporaryFile
 from time import perf_counter
 from typing import Any
@@ -188,7 +188,7 @@ class KernelCache(FunctionCache):
             super()._save_overload(sig, data)
             folders = (path for path in Path(self._cache_path).parent.iterdir() if path.is_dir())
             for outdated in sorted(folders, key=lambda path: path.stat().st_mtime)[:-MAX_FOLDERS]:
-                shutil.rmtree(outdated, ignore_errors=True)
+                rmtree(outdated, ignore_errors=True)
         except OSError as error:  # a full disk, or another process removes folders, too
             log.debug("%s is not kept: %s", self._name, error)
         finally:

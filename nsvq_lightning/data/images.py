@@ -1,10 +1,10 @@
 """From the file of a photo to the picture that a view is compared with, which is kept while a byte budget lasts."""
 
-import io
 import struct
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -119,7 +119,7 @@ def _decoded(path: Path, flags: int) -> Arrays:
             "there again"
         ) from error
     try:
-        with Image.open(io.BytesIO(data)) as head:
+        with Image.open(BytesIO(data)) as head:
             # OpenCV applies the orientation to TIFFs even when told not to.
             applied = int(head.getexif().get(Base.Orientation, 1)) if head.format == "TIFF" else 1
             _check_whole(data)
@@ -149,7 +149,7 @@ def _check_whole(data: bytes) -> None:
     Raises:
         OSError: The file is incomplete; the other errors of ``DAMAGED`` mean the same.
     """
-    file = io.BytesIO(data)
+    file = BytesIO(data)
     if data.startswith(b"\x89PNG"):
         PngImageFile(file).verify()  # OpenCV allocates chunks of any declared length, up to 2 GB, before it reads them
     elif data.startswith(b"\xff\xd8"):

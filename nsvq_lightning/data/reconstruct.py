@@ -1,22 +1,22 @@
 """Photos and frames of a video, and where they were taken from: COLMAP, in steps that can be continued."""
 
-import io
 import itertools
 import json
 import logging
 import os
 import re
-import shutil
 import sqlite3
-import threading
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from importlib import import_module
+from io import BytesIO
 from pathlib import Path
+from shutil import rmtree
 from statistics import median_high
+from threading import Event, Thread
 from typing import Any
 
 import cv2
@@ -251,7 +251,7 @@ def _compare(scene: Path, count: int, report: Report, is_video: bool, threads: i
     how = {"matching_options": matching, "device": pycolmap.Device.cpu}
     exhaustive = count * (1 + is_video) <= MAX_EXHAUSTIVE
     pairs = count * (count - 1) // 2 if exhaustive else 2 * OVERLAP * count
-    ended = threading.Event()
+    ended = Event()
 
     def poll() -> None:
         while not ended.wait(timeout=1.0):
@@ -259,7 +259,7 @@ def _compare(scene: Path, count: int, report: Report, is_video: bool, threads: i
                 done = _rows(scene, "select count(*) from two_view_geometries")[0][0]
                 report("comparing photos", min(done, pairs), pairs)
 
-    polling = threading.Thread(target=poll, daemon=True)
+    polling = Thread(target=poll, daemon=True)
     polling.start()
     try:
         if exhaustive:
@@ -281,7 +281,7 @@ def _map(scene: Path, stamps: dict[str, str], report: Report, threads: int) -> l
     work = scene / "mapping"
     sparse = scene / "sparse"
     if stamps_in(sparse) != stamps:
-        shutil.rmtree(work, ignore_errors=True)
+        rmtree(work, ignore_errors=True)
         work.mkdir()
         placed = itertools.count(1)
         count = len(stamps)
@@ -296,14 +296,14 @@ def _map(scene: Path, stamps: dict[str, str], report: Report, threads: int) -> l
         )
         report("placing cameras", count, count)  # those without a place, too
         ordered = _adding(found.values())
-        shutil.rmtree(work)
+        rmtree(work)
         if not ordered:
             return []
         for index, model in enumerate(ordered):
             (work / str(index)).mkdir(parents=True)
             model.write(work / str(index))
         write_text(work / STAMPS, json.dumps(stamps))
-        shutil.rmtree(sparse, ignore_errors=True)
+        rmtree(sparse, ignore_errors=True)
         work.rename(sparse)
     folders = sorted((path for path in sparse.iterdir() if path.name.isdecimal()), key=lambda path: int(path.name))
     return [pycolmap.Reconstruction(folder) for folder in folders]
@@ -468,7 +468,7 @@ def _converted(image: Image.Image, path: Path, kind: str) -> bytes:
         image.info.pop("exif", None)
     upright = ImageOps.exif_transpose(image)
     colours = upright.convert("RGBA" if upright.has_transparency_data else "RGB")
-    file = io.BytesIO()
+    file = BytesIO()
     colours.save(file, kind, quality=JPEG_QUALITY, exif=upright.getexif())
     return file.getvalue()
 

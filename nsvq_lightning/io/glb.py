@@ -7,9 +7,9 @@ colours for each spherical harmonic. glTF has y up: our right, down, front turne
 
 import json
 import logging
-import struct
 from collections.abc import Iterator
 from pathlib import Path
+from struct import Struct
 
 import numpy as np
 
@@ -27,7 +27,7 @@ OPACITY = f"{EXTENSION}:OPACITY"
 KERNEL = "ellipse"
 
 # Magic, version, length of the file, and what each chunk begins with, here the first: length and type.
-_HEAD, _CHUNK = struct.Struct("<4sIII4s"), struct.Struct("<I4s")
+_HEAD, _CHUNK = Struct("<4sIII4s"), Struct("<I4s")
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 

@@ -6,13 +6,13 @@ one level, each in Morton order.
 """
 
 import json
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
+from shutil import rmtree
 
 import numpy as np
 
@@ -88,7 +88,7 @@ def write_lod(
     text = json.dumps(about, separators=(",", ":"))
     write_text(target, text)
     for folder in {name.partition("/")[0] for name in old if name.count("/") == 1}.difference(folders):
-        shutil.rmtree(target.parent / folder, ignore_errors=True)
+        rmtree(target.parent / folder, ignore_errors=True)
     return total + len(text)
 
 

@@ -19,17 +19,17 @@ The palette corresponds to an SH codebook, so a scene with one needs no clusteri
 depends only on the decoded splats: a scene gives the same file with its codebooks and without them.
 """
 
-import io
 import json
 import logging
 import math
 import re
 import struct
-import zipfile
 import zlib
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any
+from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,7 @@ _LEVELS = 256
 _LARGEST = float(np.finfo(np.float32).max)
 _ZIP = b"PK\x03\x04"
 # What zipfile raises about an archive that is damaged, or of a kind that it does not read.
-_BAD_ZIP = zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, RuntimeError, ValueError
+_BAD_ZIP = BadZipFile, zlib.error, struct.error, OSError, EOFError, RuntimeError, ValueError
 
 
 def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
@@ -100,7 +100,7 @@ def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
         pictures |= sh_pictures
     contents = {META: json.dumps(meta, separators=(",", ":"), allow_nan=False).encode()}
     for name, picture in pictures.items():
-        buffer = io.BytesIO()
+        buffer = BytesIO()
         # exact=True: otherwise colours under alpha 0 are changed.
         Image.fromarray(picture).save(buffer, "WEBP", lossless=True, exact=True, quality=75, method=3)
         contents[name] = buffer.getvalue()
@@ -123,9 +123,9 @@ def write_sog(path: StrPath, scene: CompressedScene, *, palette: int = PALETTE_L
     """
     contents = sog_contents(scene.in_morton_order(), palette)
     with atomic_write(path) as file:
-        with zipfile.ZipFile(file, "w") as archive:
+        with ZipFile(file, "w") as archive:
             for name, data in contents.items():
-                entry = zipfile.ZipInfo(name)  # of 1980, stored as it is
+                entry = ZipInfo(name)  # of 1980, stored as it is
                 entry.create_system = 3  # otherwise that of the machine
                 archive.writestr(entry, data)
         return file.tell()
@@ -149,7 +149,7 @@ class _Archive:
         if not data.startswith(_ZIP):
             raise wrong_start(".sog", data, _ZIP)
         try:
-            self._zip = zipfile.ZipFile(io.BytesIO(data))
+            self._zip = ZipFile(BytesIO(data))
         except _BAD_ZIP as error:
             raise FormatError(f"truncated: no valid zip archive ({error})") from None
         self.meta = json_object(self._bytes(META, 1 << 20), META)
@@ -175,7 +175,7 @@ class _Archive:
             )
         if entry.file_size > most:
             raise FormatError(f"damaged: {name} cannot have {entry.file_size} bytes")
-        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # whose length can be limited
+        if entry.compress_type not in (ZIP_STORED, ZIP_DEFLATED):  # whose length can be limited
             raise FormatError(f"{name} is compressed by method {entry.compress_type} of zip, not 0 (none) or 8")
         try:
             with self._zip.open(entry) as file:
@@ -225,7 +225,7 @@ class _Archive:
         # Twice the bytes that uncompressed texels have.
         data = self._bytes(name, 8 * max(FEW_SPLATS, self._size // 2))
         try:
-            with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
+            with Image.open(BytesIO(data), formats=("WEBP", "PNG")) as image:
                 check_room("splats or texels", image.width * image.height, self._size)
                 return np.asarray(image.convert("RGBA"))
         except FormatError:
@@ -385,11 +385,11 @@ def _archived(path: Path) -> tuple[bytes, int]:
     if path.suffix.lower() != ".json":
         data = path.read_bytes()
         return data, len(data)
-    buffer = io.BytesIO()
+    buffer = BytesIO()
     text = path.read_text(encoding="utf-8", errors="replace")
     named = {name: path.parent / name for name in re.findall(r'"([^"]+)"', text) if name.lower().endswith(_PICTURES)}
     pictures = {name: file for name, file in named.items() if file.is_file()}
-    with zipfile.ZipFile(buffer, "w") as archive:
+    with ZipFile(buffer, "w") as archive:
         archive.write(path, META)
         for name, picture in pictures.items():
             archive.write(picture, name)

@@ -31,7 +31,6 @@ stream for each array that is not empty.
 
 import logging
 import math
-import struct
 import zlib
 from collections.abc import Mapping
 from contextlib import suppress
@@ -39,6 +38,7 @@ from dataclasses import dataclass, replace
 from gzip import GzipFile
 from importlib import import_module
 from pathlib import Path
+from struct import Struct
 from typing import Any
 
 import numpy as np
@@ -57,15 +57,15 @@ logger = logging.getLogger(__name__)
 
 _MAGIC, _GZIP = b"NGSP", b"\x1f\x8b"
 # Magic, version, N, SH degree, fractional bits, flags, and number of streams (0 up to version 3).
-_HEADER = struct.Struct("<4sIIBBBB")
-_TABLE_OFFSET = struct.Struct("<I12x")
+_HEADER = Struct("<4sIIBBBB")
+_TABLE_OFFSET = Struct("<I12x")
 _HEAD = _HEADER.size + _TABLE_OFFSET.size
 # Compressed and uncompressed bytes of a stream.
-_ENTRY = struct.Struct("<QQ")
+_ENTRY = Struct("<QQ")
 # The flags of a scene that was trained with anti-aliasing, of extensions, and of levels of detail, as Spark has them.
 ANTIALIASED, _EXTENDED, _LEVELS = 1, 2, 0x80
 # Type and length, then the number of the axes.
-_EXTENSION = struct.Struct("<III")
+_EXTENSION = Struct("<III")
 # The extension that states the axes.
 _AXES = 0xADBE0003
 # Where x, y and z point by the number that the extension holds, from 1: right or left, down or up, front or back. The

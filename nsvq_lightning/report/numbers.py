@@ -1,9 +1,9 @@
 """The numbers of a run: scores of views, ``metrics.json``, and tables."""
 
-import io
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from csv import DictWriter
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +122,7 @@ def _codes_in_use(codes: Integers, size: int) -> Json:
 
 def write_csv(path: Path, rows: Rows) -> None:
     """Write rows with the same keys as CSV, atomically; the keys of the first row, in order, are the header."""
-    text = io.StringIO()
+    text = StringIO()
     writer = DictWriter(text, fieldnames=rows[0], lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)

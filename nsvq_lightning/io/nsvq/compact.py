@@ -16,9 +16,9 @@ The streams, one by one: docs/nsvq_format.md.
 """
 
 import math
-import struct
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from struct import Struct
 
 import numpy as np
 import torch
@@ -40,7 +40,7 @@ _LATE = tuple(name for name in QUANTIZABLE if name != "scales")
 _ORDER = (*_EARLY, "means", *_LATE)
 # The last take the longest, and the longest task should not begin last.
 _LONGEST_FIRST = _LATE[::-1]
-_GRID = struct.Struct("<qqqd")
+_GRID = Struct("<qqqd")
 
 # Encodings of the streams that an attribute has, by its storage and the ends of their names.
 _STREAMS = {
