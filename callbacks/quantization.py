@@ -109,8 +109,7 @@ class CodebookInit(SplatCallback):
                 quantizer.fit(module.scene.rows(name), weight, generator=draws)
             if trainer.world_size > 1:  # a fit may leave fewer codes, so counters and all other buffers must follow
                 distributed.follow_first(trainer.strategy, cast(nn.Module, quantizer))
-        sizes = ", ".join(f"{name} {len(q.codebook)}" for name, q in module.quantizers.items())
-        if sizes:
+        if sizes := ", ".join(f"{name} {len(q.codebook)}" for name, q in module.quantizers.items()):
             log.info("iteration %d: codebooks for %d splats: %s", iteration, len(module.splats), sizes)
 
 

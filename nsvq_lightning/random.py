@@ -20,7 +20,7 @@ def generator(seed: int, step: int = 0, *salts: int | str) -> Generator:
         step: Iteration the draw belongs to.
         salts: What the draw is for, for example ``"noise"``, an attribute's name, a rank.
     """
-    key = "/".join(str(part) for part in (seed, step, *salts))
+    key = "/".join(map(str, (seed, step, *salts)))
     return Generator().manual_seed(int.from_bytes(sha256(key.encode()).digest()[:8], "little") >> 1)
 
 

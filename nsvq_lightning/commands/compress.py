@@ -37,8 +37,7 @@ def share_or_number(text: str) -> int | float:
     Raises:
         ArgumentTypeError: It is neither.
     """
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)(%?)", text)
-    if match:
+    if match := re.fullmatch(r"(\d+(?:\.\d+)?)(%?)", text):
         value = float(match[1])
         if match[2] and 0 < value <= 100:
             return value / 100

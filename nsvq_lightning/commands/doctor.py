@@ -322,8 +322,7 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
         yield Finding("good", "photos", f"all {count} registered photos can be read")
         if is_elsewhere(scene):
             yield Finding("problem", "points", f"they {ELSEWHERE}")
-    masked = {name: share for name, share in shares.items() if share < 1}
-    if masked:
+    if masked := {name: share for name, share in shares.items() if share < 1}:
         left_out = 1 - sum(masked.values()) / len(masked)
         text = f"{len(masked)} of {count} photos have pixels that do not count, {100 * left_out:.0f} % of them"
         most = min(masked, key=masked.__getitem__)

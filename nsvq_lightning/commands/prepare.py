@@ -77,7 +77,7 @@ def run(options: Namespace) -> int:
         names = _frames(options, images, report)
     else:
         names, closed = reconstruct.copy_photos(photos, source, source if in_place else images, report)
-        for reason, files in {**left_out, **closed}.items():
+        for reason, files in (left_out | closed).items():
             remarks.append(f"left out: {reconstruct.some(files)}: {reason}")
     if len(names) < 2:
         few = f"{source}: {len(names)} pictures are too few, a scene takes 50 to 300"
@@ -131,8 +131,7 @@ def _claim(options: Namespace, is_video: bool, in_place: bool) -> None:
     elif options.again:
         reconstruct.remove_database(scene)
         # The model stays until there is another, and is of no photo as it is now.
-        outdated = dict.fromkeys(reconstruct.stamps_in(scene / "sparse"), "")
-        if outdated:
+        if outdated := dict.fromkeys(reconstruct.stamps_in(scene / "sparse"), ""):
             write_text(scene / "sparse" / reconstruct.STAMPS, json.dumps(outdated))
     else:
         found = json.loads(path.read_bytes())
