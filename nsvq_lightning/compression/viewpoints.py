@@ -152,6 +152,8 @@ SOME_DETAIL = 250_000
 # Where they stand, in spreads of the detail from its middle: around a scene, or inside it up to this.
 AROUND = 0.9, 3.0
 INSIDE = 0.8
+# Splats farther from the middle of all, in distances that four fifths do not exceed, say nothing about it.
+STRAY = 10
 # Power of how much colours follow the line of sight to a place. With 4, bonsai lost 0.04 dB more.
 SHARPNESS = 8
 # Nepers that one unit of variance of the logarithm of sizes in pixels takes from it.
@@ -182,6 +184,9 @@ def likely_cameras(splats: SplatTensors, count: int, width: int = 560, height: i
     sizes = raw.scales.double().mean(1)
     sizes = sizes.clamp_min(sizes.median() - 5)  # one of no length would be all of the weight
     weights = torch.softmax(logsigmoid(raw.opacities.double()) - sizes, 0).numpy()
+    centre, usual = middle_of(means)
+    weights[np.linalg.norm(means - centre, axis=1) > STRAY * usual] = 0
+    weights /= weights.sum()
     middle = weights @ means
     reach = max(math.sqrt(weights @ ((means - middle) ** 2).sum(1)), math.exp(weights @ sizes.numpy()))
     even = torch.quasirandom.SobolEngine(7, scramble=True, seed=0).draw(5 * count)  # type: ignore[no-untyped-call]

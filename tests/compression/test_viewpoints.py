@@ -83,6 +83,15 @@ def test_a_splat_of_no_length_and_the_place_of_a_scene_change_no_view() -> None:
     np.testing.assert_allclose(found, expected, atol=0.05)
 
 
+def test_splats_far_out_hardly_change_the_views() -> None:
+    plain = painting()
+    far = RawSplats(*(torch.cat([tensor, tensor[:3]]) for tensor in plain))
+    far.means[-3:] += torch.tensor([[1e4, 0.0, 0.0], [0.0, 1e5, 0.0], [0.0, 0.0, -1e4]])
+    eyes = ([eye(camera) for camera in likely_cameras(splats, 12, 64, 48)] for splats in (plain, far))
+    away, now = (np.linalg.norm(places, axis=1).mean() for places in eyes)
+    assert now == pytest.approx(away, rel=0.1)
+
+
 def test_pictures_of_a_scene_are_its_photos() -> None:
     cameras = likely_cameras(painting(), 4, 64, 48)
     scene = own_scene(painting(), cameras)
