@@ -207,7 +207,7 @@ def known_views(path: Path, root: Path | None, scene: "CompressedScene | None" =
     if not (scene and cameras):
         return cameras, photos
     try:
-        check_cameras(list(cameras.values()), scene.means)
+        check_cameras(list(cameras.values()), scene.means, None if root else scene.cameras)
     except ValueError as error:
         log.warning("%s: the cameras of %s are not used: %s", path, root or "the folders beside it", error)
         return {}, None

@@ -47,18 +47,29 @@ def spread(rows: T, most: int) -> T:
 # Share of a scene's splats that its cameras show at least. On six scenes, their own cameras show 99 %; with y and z
 # turned round or exchanged, 43 % at most.
 MIN_SHOWN = 0.8
+# Median distance of the cameras that a scene names from those that are found, as a share of their extent: more, and one
+# of them has been moved.
+MOVED = 0.1
 
 
-def check_cameras(cameras: Sequence[Camera], means: Float32s) -> None:
-    """Check that cameras show a scene: its splats, and each some of them.
+def check_cameras(cameras: Sequence[Camera], means: Float32s, trained: Float64s | None = None) -> None:
+    """Check that cameras show a scene: its splats, and each some of them; and that they are where it says.
+
+    Another scale is not seen where a scene says nothing.
 
     Args:
         cameras: At least one.
         means: Positions ``[N, 3]``, N > 0.
+        trained: Cameras of training that the scene itself names ``[C, 4]``, if it names any.
 
     Raises:
         ValueError: They are of another scene, or in other coordinates.
     """
+    if trained is not None and len(trained):
+        places = trained[:, :3]
+        apart, _ = cKDTree([camera.packed_view[12:] for camera in cameras]).query(places)
+        if np.median(apart) > MOVED * (np.ptp(places, axis=0).max() or 1):
+            raise ValueError(f"{len(cameras)} cameras stand elsewhere than those that the scene was trained by")
     seen = seen_by(spread(cameras, SOME_CAMERAS), means)
     shown = min(seen.any(0).mean(), (seen.mean(1) > 1e-3).mean())
     if shown < MIN_SHOWN:

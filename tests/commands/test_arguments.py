@@ -32,6 +32,7 @@ from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.scene import load_cameras, load_scene
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import read_scene, save
+from nsvq_lightning.rendering.sampling import trained_by
 
 
 def test_lists_have_each_entry_once() -> None:
@@ -270,6 +271,21 @@ def test_cameras_of_another_scene_are_not_used(
     for wrong in (root, demo_scene):
         assert known_views(path, wrong, moved) == ({}, None)
         assert f"the cameras of {wrong} are not used: 9 cameras show" in caplog.text
+
+
+def test_cameras_that_stood_elsewhere_are_not_used(
+    tmp_path: Path, demo_scene: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = _without_photos(demo_scene, tmp_path / "scene")
+    photos = load_scene(demo_scene)
+    points = photos.points
+    scene = CompressedScene.from_splats(random_splats(len(points))._replace(means=points))
+    own = replace(scene, cameras=trained_by(photos.train_cameras))
+    smaller = replace(own, means=0.5 * own.means, cameras=own.cameras * [0.5, 0.5, 0.5, 1])
+    one = replace(own, cameras=own.cameras[:1])
+    assert [len(known_views(root / "scene.ply", None, each)[0]) for each in (own, smaller, one)] == [9, 0, 9]
+    assert "9 cameras stand elsewhere than those that the scene was trained by" in caplog.text
+    assert len(known_views(root / "scene.ply", root, smaller)[0]) == 9  # as asked
 
 
 def test_the_folder_of_a_trainer_may_be_named(tmp_path: Path) -> None:
