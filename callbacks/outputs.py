@@ -143,7 +143,8 @@ class LiveScene(WritingCallback):
             state = {"iteration": trainer.global_step, "of": trainer.max_steps, "phase": module.phase.name.lower()}
             if module.history:
                 state["psnr"] = f"{module.history[-1]['psnr']:.2f}"
-            scene = CompressedScene.from_splats(splats, config={"antialiased": module.antialiased, "live": state})
+            config = {"antialiased": module.antialiased, "background": module.background, "live": state}
+            scene = CompressedScene.from_splats(splats, config=config)
             scene = replace(placed(scene, module.frame), cameras=module.cameras)
             with optional(folder / viewer.LIVE_SCENE) as path:
                 save(scene, path, "paper")

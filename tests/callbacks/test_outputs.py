@@ -41,7 +41,7 @@ class Viewer(Callback):
         path = self.folder / LIVE_SCENE
         if path.exists():
             self.seen[batch_idx] = load(path)
-            self.said[batch_idx] = read_header(path).config["live"]
+            self.said[batch_idx] = read_header(path).config
             path.unlink()
             hard = CompressedScene.from_splats(pl_module.scene.hard_splats(pl_module.phase))
             self.expected[batch_idx] = placed(hard, pl_module.frame).decode().raw()
@@ -54,7 +54,7 @@ def often(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _fit(viewer: Viewer, demo_scene: Path, folder: Path, steps: int = 12) -> SplatModule:
-    module = SplatModule(sh_degree=1, codebooks=CODES)
+    module = SplatModule(sh_degree=1, codebooks=CODES, background="white")
     callbacks = [PhaseSchedule(warmup_end=3, prune_end=5, quantize_end=8, total=steps), LiveScene(), viewer]
     fit(module, ColmapDataModule(str(demo_scene)), callbacks, steps)
     return module
@@ -64,7 +64,8 @@ def test_splats_are_written_when_somebody_asks(demo_scene: Path, tmp_path: Path)
     viewer = Viewer({1, 5, 9})
     _fit(viewer, demo_scene, tmp_path)
     assert list(viewer.seen) == [2, 6, 10]
-    assert viewer.said[6] == {"iteration": 7, "of": 12, "phase": "finetune"}
+    state = {"iteration": 7, "of": 12, "phase": "finetune"}
+    assert viewer.said[6] == {"antialiased": False, "background": "white", "live": state}
     for index, splats in viewer.seen.items():
         for name, tensor in viewer.expected[index]._asdict().items():
             assert torch.equal(getattr(splats, name).detach(), tensor), (index, name)

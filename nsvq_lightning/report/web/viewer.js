@@ -640,7 +640,8 @@ async function main() {
   await shown();
   const canvas = element("canvas"), view = new ViewPoint(scene.up, scene.near);
   let renderer = new Renderer(canvas, splats);
-  const backgrounds = [scene.background, [0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5]];
+  const own = splats.header.config?.background === "white" ? [1, 1, 1] : scene.background;
+  const backgrounds = [own, [0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5]];
   const keys = new Set(), keyframes = [], waiting = [];
   let background = 0, current = scene.start, scheduled = false, sorting = false, sorted = null, last = 0, touched = 0, share = 1;
   let portion = 1, sortedPortion = 1, swaying, swayed = 0;
