@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import yaml
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
@@ -19,6 +20,7 @@ from nsvq_lightning.callbacks import (
     standard,
 )
 from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.top_level import folder_of
 from nsvq_lightning.training.module import SplatModule
 
 
@@ -62,6 +64,12 @@ def test_a_shipped_config_gives_its_callbacks() -> None:
     assert phases.schedule(45_000).ends == (15_000, 20_000, 43_000, 45_000)
     assert any(isinstance(each, RateDistortion) for each in standard("small"))
     assert {type(each) for each in standard("fast")} == {type(each) for each in standard()}
+
+
+@pytest.mark.parametrize("name", ["paper", "plain"])
+def test_runs_to_compare_with_have_the_loss_and_the_rates_of_their_papers(name: str) -> None:
+    model = yaml.safe_load((folder_of("configs") / f"{name}.yaml").read_text())["model"]
+    assert (model["psnr_loss"], model["rates"]["by_distance"], model["rates"]["means"]) == (False, False, 1.6e-4)
 
 
 @pytest.mark.parametrize("make", [lambda: standard("nosuch"), lambda: standard(nosuch=None)])
