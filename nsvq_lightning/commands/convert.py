@@ -34,7 +34,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add("inputs", nargs="+", type=Path, metavar="SCENE", help=f"files to read and join: {', '.join(formats.FORMATS)}")
     add("output", type=Path, metavar="OUT", help="file to write, of one of these formats")
-    help_ = "largest number of rows of the .sog palette for a scene without an SH codebook; "
+    help_ = "largest number of rows of the .sog palette, also of an SH codebook; "
     help_ += f"{PALETTE_LIMIT} by default, 4096 to 16384 make a smaller file"
     add("--palette", type=int, metavar="ROWS", help=help_)
     help_ = f"version of .spz; {spz.DEFAULT_VERSION} by default, which more viewers support"

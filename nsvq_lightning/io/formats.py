@@ -80,7 +80,7 @@ def save(scene: "AnySplats", path: StrPath, storage: Storage | str | None = None
         path: File to write, replaced atomically; its suffix selects the format.
         storage: Level and precision of ``.nsvq``, or the level alone, a word. For another format, the file then holds
             what the ``.nsvq`` file would decode to, so that all files of a run hold the same splats.
-        options: For ``.sog``: ``palette`` (most rows of the palette for spherical harmonics without a codebook, default
+        options: For ``.sog``: ``palette`` (most rows of the palette of spherical harmonics, also of a codebook; default
             65536). For ``.spz``: ``version`` (3 or 4, default 3) and ``axes`` (``rdf``, those of ``.ply``
             and the default, or ``rub``). For ``lod-meta.json``: ``coarser`` (scenes of the coarser levels).
 

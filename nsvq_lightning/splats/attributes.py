@@ -22,7 +22,7 @@ class Attribute:
     Attributes:
         shape: Of the values of one splat; -1 stands for the number of higher SH coefficients.
         ply: Its properties in ``.ply``: their names, or what precedes their numbers.
-        rate: Learning rate at the start (docs/recipe.md); that of the positions is times the extent of the scene.
+        rate: Learning rate at the start (docs/recipe.md); that of the positions is times a distance.
         code_share: Number of codes relative to that for scales (paper, section 4: Ks = Kr = 4·Kc = 4·Ksh); 0 for means
             and opacities, which files store in ways of their own. Others need one above 0, also without a codebook.
         error: Largest error in files of level ``compact``, where it has no codebook.

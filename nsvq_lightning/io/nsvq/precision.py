@@ -70,7 +70,7 @@ class Storage:
     """How a run stores its scene.
 
     Attributes:
-        level: One of :data:`LEVELS`.
+        level: ``compact``, or ``paper``, which loses nothing.
         precision: Largest errors of level ``compact``; level ``paper`` has none.
 
     Raises:
