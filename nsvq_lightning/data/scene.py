@@ -307,8 +307,8 @@ def load_scene(
     if masks is not None:
         mask_files = find_masks(poses.images, files, folder, root, [f"{masks}_{factor}", masks] if factor else [masks])
     sources = _image_sources(poses, files, mask_files, divisor, max_width if factor is None else None)
-    poses, frame = _framed(poses, root, origin)
-    cameras = tuple(_camera(image, source.pinhole, frame) for image, source in zip(poses.images, sources, strict=True))
+    poses, frame, near = _framed(poses, root, origin)
+    cameras = tuple(_camera(image, source.pinhole, near) for image, source in zip(poses.images, sources, strict=True))
     grey = poses.colors.size > 0 and not np.ptp(poses.colors)
     if grey:
         log.info("the points of %s have no colours: they start grey, behind those that photos show", root)
@@ -413,12 +413,12 @@ def load_cameras(
         SceneError: There is no model, or it is damaged; or it does not say how large the photos are.
     """
     root = Path(root)
-    poses, frame = _framed(read_poses(root, model, allow_outside=True), root, rest.get("origin", ZERO))
+    poses, _, near = _framed(read_poses(root, model, allow_outside=True), root, rest.get("origin", ZERO))
     lenses = {}
     for number, lens in poses.cameras.items():
         full, _ = rectify(lens, lens.width, lens.height, keep_maps=False)
         lenses[number] = _scaled(full, factor or 1, max_width if factor is None else None)
-    return {image.name: _camera(image, lenses[image.camera_id], frame) for image in poses.images}
+    return {image.name: _camera(image, lenses[image.camera_id], near) for image in poses.images}
 
 
 S = TypeVar("S")
@@ -509,8 +509,16 @@ def usable(scene: Scene) -> Scene:
     return scene
 
 
-def _framed(model: ColmapModel, root: Path, origin: Place) -> tuple[ColmapModel, Frame]:
-    """The frame of a model's cameras, and the model with an origin near them; warns of cameras that went astray."""
+# The near plane is at most so many times as far away as the nearest hundredth of the points is from its cameras, and at
+# least so many times as far as it is where cameras go around what they show.
+_NEAREST, _LEAST_NEAR = 0.25, 1e-3
+
+
+def _framed(model: ColmapModel, root: Path, origin: Place) -> tuple[ColmapModel, Frame, float]:
+    """The model with an origin near its cameras, their frame, and their near plane; warns of cameras that went astray.
+
+    Along a way, what is near is nearer than a share of the cameras' extent.
+    """
     centres = np.stack([image.centre for image in model.images])
     frame = Frame.around(centres)
     lost = np.flatnonzero(astray(centres, _CAMERA_ASTRAY))
@@ -521,12 +529,15 @@ def _framed(model: ColmapModel, root: Path, origin: Place) -> tuple[ColmapModel,
     if not any(origin) and distance >= _FARTHEST:
         origin = frame.middle
         log.info("%s: positions are relative to %s, as 0 is %.0f extents away", root, origin, distance)
+    points = spread(model.points[np.isfinite(model.points).all(1)], SOME_SPLATS)
+    nearest = np.quantile(cKDTree(centres).query(points)[0], 0.01) if len(points) else math.inf
+    near = frame.near * float(np.clip(_NEAREST * nearest / frame.near, _LEAST_NEAR, 1))
     if not any(origin):
-        return model, frame
+        return model, frame, near
     views = np.stack([image.viewmat for image in model.images])
     views[:, :3, 3] += views[:, :3, :3] @ origin
     images = tuple(replace(image, viewmat=view) for image, view in zip(model.images, views, strict=True))
-    return replace(model, images=images, points=model.points - origin), frame.relative_to(origin)
+    return replace(model, images=images, points=model.points - origin), frame.relative_to(origin), near
 
 
 def astray(places: Float64s, times: float) -> Bools:
@@ -545,10 +556,10 @@ def astray(places: Float64s, times: float) -> Bools:
     return np.asarray((distances > times * usual) & (usual > 0))
 
 
-def _camera(image: ColmapImage, lens: Pinhole, frame: Frame) -> Camera:
+def _camera(image: ColmapImage, lens: Pinhole, near: float) -> Camera:
     pose = torch.from_numpy(image.viewmat)
     try:
-        return Camera(torch.from_numpy(lens.K), pose, lens.width, lens.height, frame.near).to(dtype=torch.float32)
+        return Camera(torch.from_numpy(lens.K), pose, lens.width, lens.height, near).to(dtype=torch.float32)
     except ValueError as error:
         raise SceneError(f"camera {image.camera_id} of image {image.name}: {error}; run COLMAP again") from error
 

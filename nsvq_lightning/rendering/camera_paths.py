@@ -14,6 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from nsvq_lightning.rendering.camera import Camera, camera_of
+from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.rendering.poses import looked_at, poses, up_of, view_from, view_towards
 from nsvq_lightning.splats.conventions import Float64s
@@ -169,8 +170,8 @@ _MAX_SIDE = 1 << 16
 def read_cameras(path: Path) -> dict[str, Camera]:
     """The cameras of photos by name, as a run (:func:`nsvq_lightning.report.viewer.write_cameras`) and INRIA list them.
 
-    INRIA's trainer has principal points in the middle, and lists them in the size of the photos, which it trains with
-    as its ``cfg_args`` beside the list says.
+    INRIA's trainer has principal points in the middle and near planes at 0.2, and lists cameras in the size of the
+    photos, which it trains with as its ``cfg_args`` beside the list says.
 
     Args:
         path: JSON, a list of ``img_name``, ``width``, ``height``, ``fx``, ``fy`` (pixels), ``rotation`` (from the
@@ -197,11 +198,11 @@ def read_cameras(path: Path) -> dict[str, Camera]:
             times = 1 if "cx" in entry else _times_smaller(arguments, width)
             small = tuple(number / times for number in lens)
             size = round(width / times), round(height / times)
-            cameras[name] = camera_of(view_from(rotation, position), small, *size)
+            cameras[name] = camera_of(view_from(rotation, position), small, *size, entry.get("near", NEAR))
     if not cameras:
         return {}
     near = Frame.around(poses(list(cameras.values()))[0]).near
-    return {name: replace(camera, near=near) for name, camera in cameras.items()}
+    return {name: replace(camera, near=min(near, camera.near)) for name, camera in cameras.items()}
 
 
 def arguments_of(folder: Path) -> str:

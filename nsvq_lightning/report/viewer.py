@@ -135,7 +135,7 @@ def lens_entry(camera: Camera) -> dict[str, float]:
 
 
 def write_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
-    """Write cameras as INRIA's trainer lists them, which viewers read, with their principal points beside."""
+    """Write cameras as INRIA's trainer lists them, which viewers read, with principal points and near planes."""
     entries = [
         {
             "id": number,
@@ -143,6 +143,7 @@ def write_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
             "position": camera.position.tolist(),
             "rotation": camera.viewmat[:3, :3].T.tolist(),
             **lens_entry(camera),
+            "near": camera.near,
         }
         for number, (name, camera) in enumerate(cameras.items())
     ]

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,7 @@ def test_a_run_knows_its_cameras_without_its_photos(
     demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     save(random_splats(50), tmp_path / "scene.nsvq")
-    cameras = load_scene(demo_scene).cameras
+    cameras = [replace(camera, near=0.003) for camera in load_scene(demo_scene).cameras]
     write_cameras(tmp_path / "cameras.json", dict(zip("<bcdefgh&", cameras, strict=True)))
     (tmp_path / "config.yaml").write_text("data: {class_path: x, init_args: {root: gone}}")
     assert _run(tmp_path, "--path", "cameras", "-o", tmp_path / "frames") == 0
@@ -80,7 +81,7 @@ def test_a_run_knows_its_cameras_without_its_photos(
     for one, other in zip(found.values(), cameras, strict=True):
         assert torch.allclose(one.viewmat, other.viewmat, atol=1e-6)
         assert one.intrinsics == pytest.approx(other.intrinsics)
-        assert (one.width, one.height) == (other.width, other.height)
+        assert (one.width, one.height, one.near) == (other.width, other.height, pytest.approx(other.near))
     assert "guessed" not in capsys.readouterr().err
     (tmp_path / "cameras.json").write_text("[{}]")
     assert _run(tmp_path, "--path", "cameras") == 1

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,18 @@ from moved_scenes import write_moved
 from runs import quiet_trainer
 from transforms_scenes import write_blender, write_nerfstudio
 
+from nsvq_lightning.data import scene as scene_module
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_models
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.images import ImageHead
 from nsvq_lightning.data.photo_files import photos_below
-from nsvq_lightning.data.points import RANDOM_POINTS
+from nsvq_lightning.data.points import RANDOM_POINTS, in_picture, projected
 from nsvq_lightning.data.reconstruct import reconstruct
-from nsvq_lightning.data.scene import View, is_elsewhere, load_scene, seen_by, spread, usable
+from nsvq_lightning.data.scene import View, is_elsewhere, load_cameras, load_scene, seen_by, spread, usable
+from nsvq_lightning.data.transforms import read_poses
 from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.training.module import SplatModule
 
 SceneFactory = Callable[..., Path]
@@ -46,6 +50,32 @@ def test_a_scene_far_from_the_origin_has_another(
     np.testing.assert_allclose(far.points, near.points.numpy() - middle, atol=1e-5)
     for one, other in zip(near.standard.cameras, far.standard.cameras, strict=True):
         torch.testing.assert_close(one.viewmat, other.viewmat, atol=2e-5, rtol=0)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+@pytest.mark.parametrize("apart", [0.0, 30.0])
+def test_along_a_way_what_is_near_is_before_no_near_plane(
+    demo_scene: Path, monkeypatch: pytest.MonkeyPatch, unit: float, apart: float
+) -> None:
+    """Oracle: photos of rooms in a row, in each the points of its own."""
+    poses = read_poses(demo_scene)
+    shifts = np.arange(len(poses.images))[:, None] * [apart, 0, 0]
+    images = []
+    for image, shift in zip(poses.images, shifts, strict=True):
+        view = image.viewmat.copy()
+        view[:3, 3] = unit * (view[:3, 3] - view[:3, :3] @ shift)
+        images.append(replace(image, viewmat=view))
+    points = np.concatenate([unit * (poses.points + shift) for shift in shifts])
+    moved = replace(poses, images=tuple(images), points=points, colors=np.tile(poses.colors, (len(shifts), 1)))
+    monkeypatch.setattr(scene_module, "read_poses", lambda *_, **__: moved)
+    cameras = load_cameras(demo_scene)
+    nears = {camera.near for camera in cameras.values()}
+    frame = Frame.around(np.stack([image.centre for image in images]))
+    pictures = [(camera, unit * (poses.points + shift)) for camera, shift in zip(cameras.values(), shifts, strict=True)]
+    depths = np.concatenate([projected(points, camera)[2][in_picture(points, camera)] for camera, points in pictures])
+    assert len(nears) == 1
+    assert (depths < max(nears)).mean() < 0.01
+    assert nears == {frame.near} if apart == 0 else max(nears) < 0.1 * frame.near
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.camera_paths import orbit, read_camera_path, read_cameras, reframed, smooth_path
+from nsvq_lightning.rendering.frame import Frame
 
 
 def camera(position: Any, rotation: Rotation | None = None, focal: float = 100.0) -> Camera:
@@ -209,6 +211,19 @@ def test_cameras_of_inrias_trainer(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.viewmat, seen.viewmat, atol=1e-5)
         assert found.intrinsics == (100, 90, seen.width / 2, seen.height / 2)
         assert (found.width, found.height) == (seen.width, seen.height)
+
+
+@pytest.mark.parametrize("apart", [0.1, 1.0, 50.0])
+def test_cameras_of_inrias_trainer_have_its_near_plane_at_most(tmp_path: Path, apart: float) -> None:
+    given = [
+        replace(seen, viewmat=seen.viewmat * torch.tensor([[1, 1, 1, apart]] * 3 + [[1, 1, 1, 1]]))
+        for seen in around([0.0, 1.0, 2.0])
+    ]
+    centres = np.stack([seen.position.numpy() for seen in given])
+    entries = [_inria(seen, str(number)) for number, seen in enumerate(given)]
+    (tmp_path / "cameras.json").write_text(json.dumps(entries))
+    (near,) = {camera.near for camera in read_cameras(tmp_path / "cameras.json").values()}
+    assert near == pytest.approx(min(0.2, Frame.around(centres.astype(np.float64)).near))
 
 
 @pytest.mark.parametrize(
