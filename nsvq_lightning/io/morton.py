@@ -42,7 +42,7 @@ class Grid:
 
         Its cells are small enough for all but the smallest thousandth of splats, yet not below 2⁻²⁰ of the extent of
         all but the outermost thousandth at either end of each axis; so the cube holds all but a few far splats. Where
-        that is too coarse for half of the splats, more are outside, up to a quarter.
+        that is too coarse for a tenth of the splats, more are outside, up to a quarter.
         """
         if len(means) == 0:
             return cls(1.0, (0, 0, 0))
@@ -50,7 +50,7 @@ class Grid:
             low, high = np.quantile(means.astype(np.float64), (far, 1 - far), axis=0)
             extent = max((high - low).max(), np.abs([low, high]).max() * 2.0**-40, 1e-30)
             finest = power_above(extent * 2.0 ** (1 - AXIS_BITS))  # the scene takes up to half of each side of the grid
-            if not 0 < np.median(widest) < finest:
+            if not 0 < np.quantile(widest, 0.1) < finest:
                 break
         step = power_below(max(np.quantile(widest, 0.001), finest))
         # Cells up to a quarter of the grid lie on multiples of their own width, whichever scene it was made for.

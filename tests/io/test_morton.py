@@ -67,6 +67,15 @@ def test_many_very_far_splats_do_not_make_the_grid_coarse_either(share: float, m
     assert 1 - grid.cells(means)[1].mean() <= most + 0.001
 
 
+def test_fine_splats_decide_also_where_most_are_coarse() -> None:
+    rng = np.random.default_rng(5)
+    means = rng.standard_normal((5000, 3)).astype(np.float32)
+    means[2000:4750] *= 50
+    means[4750:] *= 300
+    widest = np.where(np.arange(5000) < 2000, 2e-4, 5e-3)
+    assert Grid.around(means, widest).step <= 2e-4
+
+
 def test_splats_in_spatial_order_are_near_the_one_before() -> None:
     """In a scene with two fifths of the splats far around it, and with some that are lost."""
     means = np.random.default_rng(5).standard_normal((4000, 3)).astype(np.float32)
