@@ -261,7 +261,7 @@ class Compressor:
         return self._between(setting, lambda each: len(each.data) <= target, lambda size: size >= close)
 
     def _finest_coded(self, target: int, splats: int, needed: bool) -> Candidate | None:
-        """The largest file with codebooks of at most ``target`` bytes; too few are refused only where it is needed."""
+        """The best file with codebooks of at most ``target`` bytes; too few are refused only where it is needed."""
         best = before = None
         asked = float(target)
         for _ in range(ESTIMATES):
@@ -274,7 +274,7 @@ class Compressor:
             found = self._fitting(setting, target)
             if not found and setting.more:
                 found = self._fitting(replace(setting, more=0), target)
-            if found and (best is None or len(found.data) > len(best.data)):
+            if found and (best is None or self.error(found) < self.error(best)):
                 best = found
             # There may be more room than the largest codebooks take.
             if self.stopped or (found and (len(found.data) >= (1 - 2 * SLACK) * target or setting == before)):
@@ -472,7 +472,9 @@ def compress(
     """
     if None not in (target_bytes, max_error):
         raise ValueError("give target_bytes or max_error, not both")
-    scene = CompressedScene.from_splats(splats, antialiased=antialiased).finite()
+    scene = CompressedScene.from_splats(splats).finite()
+    if antialiased:
+        scene = replace(scene, config={**scene.config, "antialiased": True})
     if background == "white":
         scene = on_white(scene)
     elif background != "black":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -245,6 +246,28 @@ def test_a_scene_of_another_program_is_compressed() -> None:
 
 def replace_position(camera: nl.Camera) -> nl.Camera:
     return nl.Camera(camera.K, torch.diag(torch.tensor([1.0, -1, -1, 1])) @ camera.viewmat, camera.width, camera.height)
+
+
+def test_anti_aliasing_is_that_of_a_scene_or_as_said() -> None:
+    scene = ball(100)
+    for splats, said in ((scene, True), (scene.tensors(), True), (scene, False)):
+        assert nl.compress(splats, antialiased=said, steps=4).antialiased is said
+    own = replace(scene, config={**scene.config, "antialiased": True})
+    assert nl.compress(own, steps=4).antialiased
+
+
+def test_of_files_within_a_limit_the_best_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not the largest: few splats with large codebooks may take more bytes than all of them with small ones."""
+    scene = ball(300)
+    compressor = Compressor(scene, cameras_around(scene.means, 8, 80, 60), steps=4)
+    made = [
+        SimpleNamespace(data=bytes(size), error=error) for size, error in ((10_000, 0.1), (14_000, 0.2), (19_900, 0.3))
+    ]
+    files = iter([*made, None, None, None, None, None, None])
+    monkeypatch.setattr(compressor, "_fitting", lambda *_: next(files))
+    monkeypatch.setattr(compressor, "error", lambda found: found.error)
+    monkeypatch.setattr(compressor, "at", lambda setting: SimpleNamespace(data=bytes(9_000)))
+    assert compressor._finest_coded(20_000, 300, False) is made[0]
 
 
 @pytest.mark.parametrize("share", [0.9, 1.5])
