@@ -141,7 +141,8 @@ class View:
         def squares(pixels: Tensor) -> Tensor:
             return pixels[: height * times, : width * times].view(height, times, width, times, -1)
 
-        image = squares(self.image).float().mean((1, 3)).round().to(torch.uint8)
+        levels = 255 if self.image.is_floating_point() else 1
+        image = (squares(self.image).float().mean((1, 3)).clamp(0, 255 / levels) * levels).round().to(torch.uint8)
         mask = None if self.mask is None else squares(self.mask).all(3).all(1)[..., 0]
         return replace(self, camera=camera, image=image, mask=mask)
 
@@ -219,6 +220,8 @@ _CAMERA_ASTRAY = 10
 _POINT_ASTRAY = 100
 # Distance from a camera's centre, in extents, within which a point is a failed triangulation, not a surface.
 _AT_CAMERA = 1e-6
+# Cameras that are so near to each other, over the distance of points from them, are in one place.
+_NO_PARALLAX = 1e-4
 ONE_PLACE = "are taken from one place: without parallax there is no depth; move while taking photos"
 
 
@@ -314,11 +317,14 @@ def load_scene(
         log.info("the points of %s have no colours: they start grey, behind those that photos show", root)
         poses = replace(poses, colors=np.full_like(poses.colors, 128))
     centres = np.stack([image.centre for image in poses.images])
-    extent = EXTENT * frame.unit if np.ptp(centres, axis=0).any() else 0.0
     usable = ~astray(poses.points, _POINT_ASTRAY)
     finite = np.isfinite(poses.points).all(1)
+    distances, _ = cKDTree(centres).query(poses.points[finite])
+    # What is left of one place by rounding is no parallax.
+    parallax = np.ptp(centres, axis=0).max() > _NO_PARALLAX * np.median(np.append(distances, 0))
+    extent = EXTENT * frame.unit if parallax else 0.0
     # At a camera's centre a point has no direction; splats there are in no view, or cover that camera's whole view.
-    usable[finite] &= cKDTree(centres).query(poses.points[finite])[0] > _AT_CAMERA * extent
+    usable[finite] &= distances > _AT_CAMERA * extent
     if not usable.all():
         text = "left out %d of %d points: they are at the centre of a camera, or far from all others"
         log.warning(text, len(usable) - usable.sum(), len(usable))

@@ -196,7 +196,7 @@ def _with_dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Ten
     fills = scene.grey and not scene.white
     known = 0 if fills else len(scene.points)
     if count <= known:
-        most = MOST_POINTS * count or known
+        most = MOST_POINTS * count or len(scene.points)
         return spread(scene.points, most), spread(scene.colors, most)
     start = time.perf_counter()
     points, colors = dense_points(scene, count - known, seed)

@@ -155,7 +155,10 @@ def test_view_carries_its_own_name_pose_and_picture(make_scene: SceneFactory) ->
         np.testing.assert_array_equal(view.image.numpy(), np.array(PIL.Image.open(root / "images" / view.name)))
         pose = reconstruction.find_image_with_name(view.name).cam_from_world().matrix()
         np.testing.assert_allclose(view.camera.viewmat[:3].numpy(), pose, rtol=1e-6)
-    moved = move_data_to_device(scene.view(3), torch.device("cpu"))  # Lightning's way to move a batch
+    view = scene.view(3)
+    pair = (each.smaller(2).image.int() for each in (view, replace(view, image=view.image / 255)))
+    torch.testing.assert_close(*pair, atol=1, rtol=0)  # halves are rounded either way
+    moved = move_data_to_device(view, torch.device("cpu"))  # Lightning's way to move a batch
     assert (moved.name, moved.index, moved.image.dtype) == ("003.png", 3, torch.uint8)
 
 
@@ -179,6 +182,20 @@ def test_points_and_extent(make_scene: SceneFactory) -> None:
     centres = np.stack([-camera.viewmat[:3, 3].numpy() for camera in scene.cameras])  # rotations are 1
     expected = 1.1 * np.linalg.norm(centres - np.median(centres, axis=0), axis=1).max()
     assert scene.extent == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(("noise", "apart"), [(0.0, False), (1e-6, False), (1e-2, True)])
+def test_what_rounding_leaves_of_one_place_is_no_extent(
+    demo_scene: Path, monkeypatch: pytest.MonkeyPatch, noise: float, apart: bool
+) -> None:
+    poses = read_poses(demo_scene)
+    images = []
+    for image, shift in zip(poses.images, np.random.default_rng(0).normal(0, noise, (9, 3)), strict=True):
+        view = image.viewmat.copy()
+        view[:3, 3] = -view[:3, :3] @ (poses.images[0].centre + shift)
+        images.append(replace(image, viewmat=view))
+    monkeypatch.setattr(scene_module, "read_poses", lambda *_, **__: replace(poses, images=tuple(images)))
+    assert (load_scene(demo_scene).extent > 0) is apart
 
 
 @pytest.mark.parametrize("value", [0, 255])

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -91,7 +91,9 @@ def test_of_a_dense_cloud_some_points_are_taken(known: int, kept: int) -> None:
     found, colors = run_scene._with_dense_points(scene, 10, 0)
     assert len(found) == len(colors) == kept
     assert torch.equal(found / points.max(), colors)
-    assert torch.equal(run_scene._with_dense_points(scene, 0, 0)[0], points)  # those of SfM alone
+    for grey in (False, True):
+        alone = SimpleNamespace(**vars(scene) | {"grey": grey})
+        assert torch.equal(run_scene._with_dense_points(cast(Any, alone), 0, 0)[0], points)  # those of SfM alone
     steps = found[:, 0].diff()
     assert (steps == steps[0]).all()  # evenly spread
 
