@@ -24,7 +24,7 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, Schedule
 
 from .base import SplatCallback
-from .density import Densification, reset_opacities
+from .density import KEPT, Densification, reset_opacities
 from .settings import AT_LEAST_1, Count, NonNegative, Opacity, Positive, Share, Whole
 
 log = logging.getLogger(__name__)
@@ -116,7 +116,7 @@ def split_longest(parents: RawSplats) -> RawSplats:
     return RawSplats(*map(torch.cat, zip(*pair, strict=True)))
 
 
-# Growth is idle if it adds at most this share of what it may add, or of what there is.
+# Growth is idle if it adds less than this share of what it may add, or of what there is.
 IDLE = 0.01
 
 
@@ -199,12 +199,13 @@ class BudgetedGrowth(Densification):
 
         Args:
             schedule: Phases of the run.
-            first: Splats at the start.
+            first: Points at the start, of which no more become splats than growth leaves room for.
             budget: Splats at the end, after their selection.
         """
         warmup = schedule.share(schedule.warmup_end)
         full = min(schedule.share(self.full), warmup)
         most = round(self.overshoot * budget)
+        first = min(first, round(KEPT * most))
         grows = round(first + (most - first) * 2 / 3)  # along the root of the time
         return [(full, grows), (warmup - full, most), (1 - warmup, budget)]
 
@@ -252,6 +253,8 @@ class BudgetedGrowth(Densification):
             self.prune(module, module.splats.opacities.sigmoid() < self.first_opacity)
         if self.is_due(module, iteration):
             self._split_and_prune(module, iteration)
+            if module.schedule is not schedule:  # the phase has ended
+                return
         photos = getattr(run_scene.scene_of(trainer), "train", ())
         resets = schedule.reset_times(self.reset_last * (len(photos) >= self.reset_photos), self.reset_every)
         if iteration in resets:
@@ -270,7 +273,7 @@ class BudgetedGrowth(Densification):
             pruned = self.prune(module, module.splats.opacities.sigmoid() < self.min_opacity)
         distributed.check_replicas(module.trainer, "growth")
         log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
-        self.idle = self.idle + 1 if added <= IDLE * min(room, len(module.splats)) else 0
+        self.idle = self.idle + 1 if added < IDLE * min(room, len(module.splats)) else 0
         if self.idle >= self.patience > 0:
             module.schedule = replace(schedule, saved=schedule.saved + last - iteration)
             log.info(

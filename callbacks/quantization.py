@@ -334,7 +334,7 @@ class RateDistortion(SplatCallback):
             quantizer, rows = module.quantizers[name], module.scene.rows(name)
             codes = attributes.codes_of(module.splats.raw(), name, quantizer).clone()
             rates = code_rates(codes, len(quantizer.codebook))
-            codes[part] = cheapest(rows[part], quantizer.codebook, rates, price[part])
+            codes[part] = cheapest(rows[part], quantizer.codebook, rates, price[part].to(rows))
             cast(Any, quantizer).hold(codes)
 
 

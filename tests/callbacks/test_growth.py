@@ -197,6 +197,22 @@ def test_opacities_are_not_reset_where_photos_are_few() -> None:
         assert stage.opacities == pytest.approx([ceiling] * 10)
 
 
+def test_growth_that_is_full_is_not_idle_and_growth_that_ends_resets_nothing() -> None:
+    full = stage_of([0.9] * 4, BudgetedGrowth(**RULES | {"patience": 1}, budget=2, overshoot=2.0))
+    full.step(110, view([1e-3] * 4, [1.0] * 4, [True] * 4), BATCH)
+    assert (full.count, full.module.schedule.saved) == (4, 0)
+    idle = stage_of([0.9] * 4, BudgetedGrowth(**RULES | {"patience": 1}, budget=1000))
+    idle.step(40, view([0.0] * 4, [1.0] * 4, [True] * 4), BATCH)
+    assert (idle.opacities, idle.module.schedule.saved) == (pytest.approx([0.9] * 4), 80)
+
+
+def test_a_run_starts_with_no_more_points_than_growth_leaves_room_for() -> None:
+    growth = BudgetedGrowth(overshoot=2.0)
+    few, dense, denser = (growth.stretches(SCHEDULE, first, 1000) for first in (500, 1400, 10**7))
+    assert few[0][1] < dense[0][1] < 2000
+    assert denser == dense
+
+
 def test_nothing_happens_after_warm_up() -> None:
     stage = stage_of([0.001] * 5, BudgetedGrowth(**RULES, budget=1000))
     stage.step(130, view([1.0] * 5, [1.0] * 5, [True] * 5), BATCH)
