@@ -255,10 +255,14 @@ class ImageSource:
     white: bool = False
 
     @property
+    def masked(self) -> bool:
+        """Whether only some of its pixels count."""
+        return self.mask is not None or (self.has_alpha and not self.white)
+
+    @property
     def nbytes(self) -> int:
         """Bytes of the picture in memory."""
-        masked = self.mask is not None or (self.has_alpha and not self.white)
-        return (3 + masked) * self.pinhole.width * self.pinhole.height
+        return (3 + self.masked) * self.pinhole.width * self.pinhole.height
 
     def load(self) -> Picture:
         """The picture.

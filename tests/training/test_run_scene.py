@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from lightning.pytorch import Trainer
@@ -16,6 +19,7 @@ from splat_scenes import random_splats
 
 from nsvq_lightning.callbacks import PhaseSchedule
 from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.data.points import projected
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.rendering.constants import NEAR
@@ -96,6 +100,30 @@ def test_of_a_dense_cloud_some_points_are_taken(known: int, kept: int) -> None:
         assert torch.equal(run_scene._with_dense_points(cast(Any, alone), 0, 0)[0], points)  # those of SfM alone
     steps = found[:, 0].diff()
     assert (steps == steps[0]).all()  # evenly spread
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.3, 1.0])
+def test_points_that_are_always_masked_become_no_splats(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: float
+) -> None:
+    """Oracle: points whose row is above the border of the masks in some train photo; of masks without them all stay."""
+    shutil.copytree(demo_scene, tmp_path / "scene")
+    data = ColmapDataModule(str(tmp_path / "scene"))
+    scene, shown = data.scene, np.zeros(len(data.scene.points), bool)
+    (tmp_path / "scene" / "masks").mkdir()
+    for index, (name, camera) in enumerate(zip(scene.names, scene.cameras, strict=True)):
+        mask = np.zeros((camera.height, camera.width), np.uint8)
+        border = max(1, round(kept * camera.height))
+        mask[:border] = 255
+        cv2.imwrite(str(tmp_path / "scene" / "masks" / f"{name}.png"), mask)
+        column, row, _ = projected(scene.points.double().numpy(), camera)
+        shown |= (index in scene.train) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < border)
+    nothing = torch.empty(0, 3), torch.empty(0, 3)
+    monkeypatch.setattr(run_scene, "dense_points", lambda *_: nothing)
+    monkeypatch.setattr(run_scene, "far_points", lambda *_: nothing)
+    trainer: Any = SimpleNamespace(datamodule=ColmapDataModule(str(tmp_path / "scene")))
+    assert len(first_splats(trainer, 0, 10**6, 0)) == (shown.sum() or len(shown))
+    assert len(first_splats(trainer, 0, None, 0)) == len(shown)  # as in 3DGS
 
 
 def test_a_lone_point_before_the_cameras_does_not_hide_the_scene(make_scene: Callable[..., Path]) -> None:
