@@ -57,7 +57,7 @@ class DevicePhotos:
         self._most = most_bytes
         self._free = 0
         self._device = torch.device("cpu")
-        self._kept: dict[int, View] = {}
+        self._kept: dict[tuple[int, tuple[int, int]], View] = {}
 
     def move(self, view: View, device: torch.device) -> View:
         """The view with its photo and mask on the device."""
@@ -67,12 +67,13 @@ class DevicePhotos:
             self._device = device
             self._kept = {}
             self._free = min(self._most, _spare(device))
-        if view.index in self._kept:
-            return self._kept[view.index]
+        key = view.index, view.camera.size  # one's own data may give a view in several sizes
+        if key in self._kept:
+            return self._kept[key]
         moved = view.to(device)
         taken = Picture(moved.image, moved.mask).nbytes
         if taken <= self._free:
-            self._kept[view.index] = moved
+            self._kept[key] = moved
             self._free -= taken
         return moved
 

@@ -190,6 +190,12 @@ def test_the_first_photos_stay_while_the_budget_lasts() -> None:
         assert (there.name, there.camera) == (here.name, here.camera)
 
 
+def test_a_view_in_several_sizes_keeps_each() -> None:
+    photos, view = DevicePhotos(10 * BYTES), _view(0)
+    sizes = [photos.move(each, ELSEWHERE).image.shape for each in (view.smaller(2), view, view.smaller(2))]
+    assert sizes == [(2, 2, 3), (4, 5, 3), (2, 2, 3)]
+
+
 def test_a_gpu_gives_a_part_of_what_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(datamodule, "_spare", lambda _: BYTES)
     photos, views = DevicePhotos(10 * BYTES), [_view(i) for i in range(2)]
