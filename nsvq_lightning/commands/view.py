@@ -163,7 +163,11 @@ class _Handler(BaseHTTPRequestHandler):
         if is_question and self.live is not None:
             # What was asked of a run that has ended in between is taken back.
             ask = end_live if self.file.exists() else ask_live
-            ask(self.live.parent)
+            try:
+                ask(self.live.parent)
+            except OSError as error:  # a folder of somebody else, or a full disk
+                self._answer(503, f"the run cannot be asked: {error}".encode())
+                return
         file = self.live if self.live is not None and self.live.is_file() else self.file
         try:
             if not file.is_file():

@@ -55,6 +55,15 @@ def address(run: Path, demo_scene: Path) -> Iterator[str]:
         server.shutdown()
 
 
+def test_a_run_that_cannot_be_asked_says_why(run: Path, address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def ask_live(folder: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(folder))
+
+    monkeypatch.setattr(viewer, "ask_live", ask_live)
+    status, text = _get(f"{address}/version")
+    assert (status, text.startswith(b"the run cannot be asked: [Errno 13] Permission denied")) == (503, True)
+
+
 def test_a_running_fit_is_asked_until_its_scene_is_there(run: Path, address: str) -> None:
     assert not viewer.live_asked(run)
     assert _get(f"{address}/scene.nsvq") == (503, b"waiting for the run to show its splats")
