@@ -127,7 +127,7 @@ def _path(
     elif not cameras:
         if kind != "orbit":
             raise ValueError(f"--path {kind} needs cameras of photos: name their folder (--data.root), or take orbit")
-        log.info("no photos: their cameras are guessed from the scene; --data.root names the folder of the photos")
+        log.info("no photos: cameras are guessed from the scene (-y is up); --data.root names their folder")
         cameras = likely_cameras(splats, 24)
     width, height = options.size or cameras[0].size
     if is_video and (width % 2 or height % 2):
