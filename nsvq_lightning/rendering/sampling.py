@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 MAX_CAMERAS = 64
 # Focal lengths that differ by less count as one.
 SAME_SIZE = 0.01
-# A camera within this share of the spread of all cameras stands for another.
-NEAR_ENOUGH = 0.2
+# A camera within this share of the spread of all cameras stands for another. With 0.2, splats beside a corridor of 130
+# times their distance were shown as seen from afar, 28 dB from how they were trained; with 0.1 it is 44 dB.
+NEAR_ENOUGH = 0.1
 
 
 class ViewSampling(NamedTuple):
@@ -126,9 +127,10 @@ def fewer_cameras(cameras: Float64s) -> Float64s:
     """Those of cameras ``[C, 4]`` that :func:`trained_by` keeps."""
     if len(cameras) == 0:
         return cameras
-    positions = cameras[:, :3]
-    apart = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    apart = np.linalg.norm(cameras[:, :3] - np.median(cameras[:, :3], axis=0), axis=1)
     spread = apart.max()
+    # A lens that magnifies e times is as far from another as the cameras' spread.
+    positions = np.c_[cameras[:, :3], (spread or 1) * np.log(cameras[:, 3])]
     chosen = [apart.argmax()]
     apart = np.linalg.norm(positions - positions[chosen[0]], axis=1)
     while len(chosen) < MAX_CAMERAS and apart.max() > NEAR_ENOUGH * spread:

@@ -15,7 +15,7 @@ from splat_scenes import front_camera, random_splats
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.rasterize import render
-from nsvq_lightning.rendering.sampling import MAX_CAMERAS, Sampling, focal_of, trained_by
+from nsvq_lightning.rendering.sampling import MAX_CAMERAS, Sampling, fewer_cameras, focal_of, trained_by
 from nsvq_lightning.splats.splats import RawSplats
 
 assert_same = partial(oracle.assert_same, "cpu")
@@ -121,3 +121,14 @@ def test_few_cameras_stand_for_many() -> None:
     assert np.linalg.norm(places[:, None] - kept[None, :, :3], axis=2).min(1).max() < 3
     assert trained_by([]).shape == (0, 4)
     assert len(trained_by(cameras[:1] * 5)) == 1
+
+
+def test_places_along_a_way_and_every_lens_are_kept() -> None:
+    corridor = np.c_[np.linspace(0, 200, 201), np.zeros((201, 2)), np.full(201, 500.0)]
+    kept = fewer_cameras(corridor)
+    wall = torch.tensor([[30.0, 1.5, 0.0], [71.0, 1.5, 0.0]])
+    (nearest, _), _ = Sampling.of(wall, kept)
+    assert float(nearest.max()) < 7
+    corridor[[20, 77]] += [0.1, 0, 0, 800]
+    assert set(fewer_cameras(corridor)[:, 3]) == {500, 1300}
+    assert set(fewer_cameras(np.array([[1.0, 2, 3, 500], [1, 2, 3, 1300], [1, 2, 3, 500]]))[:, 3]) == {500, 1300}
