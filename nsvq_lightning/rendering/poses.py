@@ -37,10 +37,13 @@ def up_of(cameras: Sequence[Camera]) -> Float64s:
 
     It is at right angles to where their right is, the sum of the sines of their rolls being least, so that a minority
     of photos in portrait format or askew does not count; where that leaves a choice, it is near their upper edges.
-    Looking up or down does not matter.
+    Looking up or down does not matter; where all look one way and their upper edges do not agree, as from a drone that
+    turns above the ground, that way is down.
     """
     axes = poses(cameras)[1].as_matrix()
-    right, upper = axes[:, :, 0], -axes[:, :, 1].mean(0)
+    right, upper, forward = axes[:, :, 0], -axes[:, :, 1].mean(0), axes[:, :, 2].mean(0)
+    if np.linalg.norm(upper) < 0.3 and np.linalg.norm(forward) > 0.9:
+        return np.asarray(-forward / np.linalg.norm(forward))
     if np.linalg.norm(upper) < 0.1:  # they are turned in all directions
         return np.asarray(-axes[0, :, 1])
     weights = np.ones(len(axes))

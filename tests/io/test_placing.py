@@ -16,7 +16,7 @@ from nsvq_lightning.compression.viewpoints import look_at
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.placing import UP_AXES, moved, rotated, turn_up
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.poses import up_of
+from nsvq_lightning.rendering.poses import up_of, view_from
 from nsvq_lightning.rendering.rasterize import render
 from tests.support.splat_scenes import ball
 
@@ -96,3 +96,14 @@ def test_up_becomes_the_axis(axis: str, up: list[float]) -> None:
 @pytest.mark.parametrize("up", [[0.0, -1, 0], [0, 0, 1], [0.36, -0.48, 0.8]])
 def test_up_is_where_most_cameras_hold_it(up: list[float]) -> None:
     np.testing.assert_allclose(up_of(cameras_with_up(np.array(up))), up, atol=0.02)
+
+
+@pytest.mark.parametrize("up", [[0.0, -1, 0], [0.36, -0.48, 0.8]])
+def test_a_drone_that_turns_above_the_ground_looks_down(up: list[float]) -> None:
+    lift = np.linalg.inv(turn_up(np.array(up), "minus-y"))
+    unsteady, views = Rotation.from_rotvec(0.03 * np.random.default_rng(0).normal(size=(28, 3))), []
+    for number in range(28):  # strips to and fro
+        turn = Rotation.from_euler("xy", [-np.pi / 2, np.pi * (number // 4 % 2)]) * unsteady[number]
+        views.append(view_from(lift @ turn.as_matrix(), lift @ np.array([number % 4, -30.0, number // 4])))
+    cameras = [Camera(torch.eye(3), view, 40, 30) for view in views]
+    np.testing.assert_allclose(up_of(cameras), up, atol=0.03)
