@@ -74,13 +74,15 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
 
     Args:
         image: ``[H, W, 3]`` in [0, 1].
-        target: ``[H, W, 3]`` in [0, 1].
+        target: ``[H, W, 3]``, uint8 or in [0, 1].
         mask: Which pixels count ``[H, W]`` bool; None if all do.
 
     Raises:
-        ValueError: The shapes differ.
+        ValueError: The shapes differ, or the image is none of floats.
     """
     check_pair(image, target, mask)
+    if target.dtype == torch.uint8:
+        target = eight_bit(target)
     # The norm sums in float64 without making a float64 copy of the images.
     error = torch.linalg.vector_norm(apply_mask(image - target, mask), dtype=torch.float64)
     return -10.0 * torch.log10(mean_of_kept(error.square() / image.numel(), mask))

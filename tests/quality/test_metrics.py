@@ -7,6 +7,7 @@ import torch
 from skimage.metrics import peak_signal_noise_ratio
 from torch import Tensor
 
+from nsvq_lightning.quality.loss import ssim
 from nsvq_lightning.quality.metrics import build_lpips, eight_bit, psnr
 
 
@@ -25,6 +26,10 @@ def test_psnr_is_scikit_images_and_knows_eight_bits() -> None:
     assert float(by_hand) == pytest.approx(-20 * math.log10(102 / 255), abs=1e-4)
     almost, photo = torch.full((2, 2, 3), 128.4 / 255), torch.full((2, 2, 3), 128, dtype=torch.uint8)
     assert psnr(eight_bit(almost), eight_bit(photo)).isinf()
+    assert psnr(eight_bit(almost), photo).isinf()
+    for measure in (psnr, ssim):
+        with pytest.raises(ValueError, match="the image must be of floats"):
+            measure(photo, photo)
     assert torch.equal(eight_bit(torch.tensor([-0.5, 1.7])), torch.tensor([0.0, 1.0]))
     with pytest.raises(ValueError, match=r"must both be \[H, W, 3\]"):
         psnr(torch.zeros(4, 4, 3), torch.zeros(4, 5, 3))
