@@ -1,12 +1,13 @@
 """What callbacks share: the check of the module, acting once per step, the folder of the run, the search for NaN."""
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from lightning.pytorch import Callback, Trainer
 from torch.utils._pytree import tree_map_only
 
+from nsvq_lightning.quantize.codebook import held_codes
 from nsvq_lightning.report.pictures import file_stem
 from nsvq_lightning.training import row_ops
 from nsvq_lightning.training.module import SplatModule
@@ -179,7 +180,7 @@ def has_gradients(trainer: Trainer) -> bool:
 
 
 def keep_finite_splats(module: SplatModule) -> None:
-    """Drop non-finite splats, with their frozen codes (:func:`nsvq_lightning.training.row_ops.drop_non_finite`).
+    """Drop non-finite splats, with their codes (:func:`nsvq_lightning.training.row_ops.drop_non_finite`).
 
     The replicas of several processes are equal, so all drop the same splats without communication. Dropping splats
     loses gradients: call it between an update and the next backward pass.
@@ -192,5 +193,7 @@ def keep_finite_splats(module: SplatModule) -> None:
     if len(module.splats) == len(kept):
         return
     for quantizer in module.quantizers.values():
+        if (held := held_codes(quantizer, len(kept))) is not None:
+            cast(Any, quantizer).hold(held[kept])
         if len(quantizer.codes) > 0:
             quantizer.freeze(quantizer.codes[kept])

@@ -169,7 +169,7 @@ def draw_far_rows(rows: Tensor, codebook: Tensor, count: int, generator: Generat
         count: Number of rows wanted; fewer are returned if fewer differ from their code.
         generator: Source of the draw.
     """
-    squared = (rows - codebook[nearest(rows, codebook)]).square().sum(1).double()
+    squared = (rows - codebook[nearest(rows, codebook)]).square().sum(1).double().nan_to_num(0)
     # The largest w / e with e ~ Exp(1) are a draw without replacement with weights w (Efraimidis and Spirakis 2006).
     draws = torch.empty(len(rows), dtype=torch.float64, device=generator.device).exponential_(generator=generator)
     return (squared / draws.to(rows.device)).topk(min(count, int((squared > 0).sum()))).indices

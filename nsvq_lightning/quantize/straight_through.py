@@ -62,6 +62,9 @@ class PostHoc(CodebookQuantizer):
     Leave the fine-tune phase out (``phases.quantize_end`` at the end of the run): it would train the codebooks.
     """
 
+    # Codes that rows hold would keep the codebook of that moment: there is no such method here.
+    hold = property()
+
     def forward(
         self, x: Tensor, generator: Generator | None = None, rows: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:

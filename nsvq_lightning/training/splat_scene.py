@@ -52,6 +52,7 @@ class SplatScene:
         """Rows ``[N, D]`` of a quantized attribute, detached."""
         return attribute_rows(self.splats.raw(), attribute)
 
+    @torch.inference_mode(False)  # a quantizer may fit its codebook, which is trained afterwards
     @torch.no_grad()
     def hard_splats(self, phase: Phase) -> RawSplats:
         """The splats as a file written in ``phase`` would hold them, detached: hard codes from ``QUANTIZE`` on.

@@ -245,6 +245,15 @@ def test_codes_that_follow_an_edit_are_not_searched_again(caplog: pytest.LogCapt
     assert not caplog.records
 
 
+def test_held_codes_follow_an_edit() -> None:
+    stage = Stage()
+    stage.quantizer.hold(torch.tensor([3, 3, 0, 1]))
+    with torch.no_grad():
+        stage.splats.quats[1] = math.nan
+    keep_finite_splats(stage.module)
+    assert stage.start(FIRST) == [3, 0, 1]
+
+
 def test_a_resumed_run_keeps_the_codes_of_its_checkpoint() -> None:
     stage = Stage()
     stage.quantizer.freeze(torch.tensor([3, 3, 0, 1]))

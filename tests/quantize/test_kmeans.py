@@ -20,6 +20,8 @@ def test_rows_are_drawn_by_squared_distance() -> None:
 def test_rows_on_their_codes_are_never_drawn() -> None:
     rows = torch.tensor([[0.0], [0.0], [2.0], [1.0]]).expand(4, 3)
     assert sorted(draw_far_rows(rows, torch.zeros(1, 3), 4, generator(0)).tolist()) == [2, 3]
+    rows[3, 1] = torch.nan
+    assert draw_far_rows(rows, torch.zeros(1, 3), 4, generator(0)).tolist() == [2]
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 63, 64])

@@ -133,6 +133,10 @@ def test_codes_are_kmeans_of_the_rows_that_are_encoded_whatever_came_before() ->
     assert torch.equal(hard, quantizer.decode(found))
 
 
+def test_rows_hold_no_codes_that_would_keep_the_codebook() -> None:
+    assert not hasattr(PostHoc(16, 3), "hold")
+
+
 def test_rows_that_are_not_finite_have_no_part_in_the_codebook() -> None:
     quantizer, _ = fitted(PostHoc)
     rows = torch.randn(100, 3, generator=generator(5))

@@ -82,6 +82,17 @@ def test_files_hold_codes_from_the_quantize_phase_on() -> None:
     assert len(torch.unique(scene.hard_splats(Phase.QUANTIZE).scales, dim=0)) <= 6
 
 
+def test_codebooks_that_are_fitted_for_an_evaluation_are_trained_afterwards() -> None:
+    scene = with_codebooks(scene_of_splats(), PostHoc, scales=6)
+    with torch.no_grad():
+        scene.splats.scales.zero_()
+    with torch.inference_mode():
+        scene.hard_splats(Phase.QUANTIZE)
+    assert len(scene.quantizers["scales"].codebook) == 1
+    quantizer = scene.quantizers["scales"]
+    assert not any(each.is_inference() for each in (*quantizer.parameters(), *quantizer.buffers()))
+
+
 def test_before_the_codebooks_everything_is_stored_as_it_is(caplog: pytest.LogCaptureFixture) -> None:
     scene = with_codebooks(scene_of_splats(), NSVQ, scales=6)
     stored = scene.compressed(Phase.PRUNE, {})
