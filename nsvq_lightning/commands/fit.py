@@ -75,6 +75,7 @@ class RunStart(SaveConfigCallback):
             for option in ("data.init_args.root", "model.init_from"):
                 if isinstance(given := self.config.get(option), str):  # so that it is found from any folder
                     self.config[option] = os.path.abspath(os.path.expanduser(given))
+            self.config["ckpt_path"] = None  # who repeats a run does not continue it
             self._write(folder)
 
     def on_train_end(self, trainer: Trainer, pl_module: SplatModule) -> None:  # type: ignore[override]
@@ -256,7 +257,7 @@ def continuation(checkpoint: Path) -> str:
     """The shell command that continues from a checkpoint, with the settings of the run that wrote it."""
     as_module = Path(sys.argv[0]).parts[-2:] == ("nsvq_lightning", "__main__.py")
     program = ["python", "-m", "nsvq_lightning"] if as_module else ["nsvq"]
-    folder, path = checkpoint.parents[1].as_posix(), checkpoint.as_posix()
+    folder, path = Path(os.path.normpath(checkpoint / "../..")).as_posix(), checkpoint.as_posix()
     options = [f"--config={folder}/config.yaml", f"--ckpt_path={path}", f"--trainer.run_folder={folder}"]
     return shlex.join([*program, "fit", *options])
 

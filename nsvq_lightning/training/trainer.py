@@ -82,10 +82,12 @@ class SplatTrainer(Trainer):
             FileNotFoundError: No such checkpoint.
             FormatError: It is damaged.
         """
+        path = Path(output)
+        if output == "scene.nsvq" and path.exists():  # nobody has named it
+            raise FileExistsError(f"{output} exists here: name another file with --output, or remove it")
         checkpoint = read_checkpoint(ckpt_path)
         model.on_load_checkpoint(checkpoint)
         model.load_state_dict(checkpoint["state_dict"])
-        path = Path(output)
         make_folder_of(path)
         scene = model.compressed()
         size = save(scene, path, model.storage)

@@ -97,6 +97,7 @@ def test_a_run_goes_on_with_the_options_given_and_counts_its_lines(
     folder = tmp_path / demo_scene.name / "version_0"
     config = yaml.safe_load((folder / "config.yaml").read_text())
     assert config["model"]["rates"]["opacities"] == 0.0123
+    assert config["ckpt_path"] is None
     # Lightning restores the optimiser with its stored rates; ours must still be the new one.
     stored = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
     rates = {group["name"]: group["lr"] for group in stored["optimizer_states"][0]["param_groups"]}
@@ -206,8 +207,11 @@ def test_only_the_command_line_names_what_is_imported(
         assert main([*command, "--ckpt_path=last.ckpt"]) == 1
         assert "name it: --model.quantizer=elsewhere.Mine, or" in capsys.readouterr().err
         assert not mark.exists()
-    assert main(["export", "--ckpt_path=last.ckpt", "--model.quantizer=elsewhere.Mine"]) == 0
+    export = ["export", "--ckpt_path=last.ckpt", "--model.quantizer=elsewhere.Mine"]
+    assert main(export) == 0
     assert mark.exists()
+    assert main(export) == 1
+    assert "scene.nsvq exists here: name another file" in capsys.readouterr().err
     assert read_nsvq(tmp_path / "scene.nsvq").config["quantizers"]["sh0"] == "Mine"
 
 

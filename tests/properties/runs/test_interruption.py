@@ -338,6 +338,7 @@ def test_the_command_that_continues_is_that_of_the_program(monkeypatch: pytest.M
     options = f"--config={Path('a b', 'config.yaml')}", f"--ckpt_path={checkpoint}", "--trainer.run_folder=a b"
     rest = ["fit", *options]
     assert shlex.split(continuation(checkpoint)) == ["nsvq", *rest]
+    assert continuation(Path("last.ckpt")).endswith("--trainer.run_folder=..")
     monkeypatch.setattr(sys, "argv", ["/somewhere/nsvq_lightning/__main__.py"])
     assert shlex.split(continuation(checkpoint)) == ["python", "-m", "nsvq_lightning", *rest]
 
