@@ -187,7 +187,8 @@ class DensityControl(Densification):
 
     max_splats: int | None = None
     """Upper limit on the number of splats. Of more at the start, or about as many points, 0.7 of it are drawn by what
-    they contribute to the train views; in growth, the largest statistic comes first. None for none, as in the paper."""
+    they contribute to the train views; in growth, the largest statistic comes first. None for the budget (--splats)
+    where there is one, and otherwise for no limit, as in the paper."""
     start: Count = 600
     """First iteration that clones and splits."""
     last: int = 14_900
@@ -228,8 +229,8 @@ class DensityControl(Densification):
             raise ValueError(f"max_splats must be at least min_splats={self.min_splats}, got {self.max_splats}")
 
     def limit(self, module: SplatModule) -> int | None:
-        """``max_splats``."""
-        return self.max_splats
+        """``max_splats``, or else the module's budget, if it has one."""
+        return self.max_splats or module.splat_budget
 
     def ask(self, module: SplatModule, iteration: int, batch: View) -> bool:
         """Count the views of the warm-up phase; the gradients are there in any case."""
@@ -277,9 +278,9 @@ class DensityControl(Densification):
         statistic = gradient_sum / views.clamp(min=1)
         large = splats.scales.amax(1).exp() > self.dense_fraction * module.extent
         grown = statistic >= self.grad_threshold
-        if self.max_splats is not None:
+        if (limit := self.limit(module)) is not None:
             ranks = torch.where(grown, statistic, -torch.inf)
-            grown &= top_rows(ranks, max(0, self.max_splats - len(splats)))
+            grown &= top_rows(ranks, max(0, limit - len(splats)))
         clones, parents = (detached(splats).take(grown & mask) for mask in (~large, large))
         children = split(parents, self.shrink, generator(module.seed, iteration, "split"))
         new = RawSplats(*map(torch.cat, zip(clones, children, strict=True)))

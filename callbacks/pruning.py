@@ -56,7 +56,7 @@ VIEWS = 64
 
 @dataclass(eq=False)
 class SplatSelection(SplatCallback):
-    """When the prune phase starts, removes the splats that the train views miss least, until a budget is left.
+    """After the warm-up phase, removes the splats that the train views miss least, until a budget is left.
 
     Without a splat, a pixel I changes by Δ = -α ∂I/∂α, exactly; splats with the least Σ Δ² over the pixels of the train
     views go (:func:`nsvq_lightning.training.importance.sensitivity` estimates it, and it is moved towards what is
@@ -72,7 +72,7 @@ class SplatSelection(SplatCallback):
 
     def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether splats are selected before this iteration."""
-        return iteration == module.schedule.first_of(Phase.PRUNE)
+        return iteration == module.schedule.ends[Phase.WARMUP] + 1
 
     def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Select when due.

@@ -174,6 +174,13 @@ def test_growth_stops_at_the_cap() -> None:
     assert stage.module.splats.means.detach()[:3].tolist() == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
 
 
+def test_growth_stops_at_the_budget_that_was_asked_for() -> None:
+    stage = stage_of([SMALL, SMALL, LARGE, LARGE], [0.5] * 4, DensityControl(min_splats=1))
+    stage.module.splat_budget = 5
+    stage.step(600, view([3e-4, 4e-4, 5e-4, 9e-4], [True] * 4))
+    assert stage.count == 5
+
+
 @pytest.mark.parametrize("cap", [4, 5, 6, 7, 9])
 def test_growth_fills_the_cap_with_clones_and_splits(cap: int) -> None:
     stage = stage_of([SMALL, LARGE, LARGE, SMALL], [0.5] * 4, DensityControl(min_splats=1, max_splats=cap))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -76,6 +77,11 @@ def test_opaque_splats_count_although_their_middle_has_no_gradient() -> None:
 @pytest.mark.parametrize(("until", "left"), [(10, 20), (11, 7)])
 def test_it_acts_when_the_phase_starts_by_the_modules_budget(until: int, left: int) -> None:
     assert len(selected(random_splats(20), SplatSelection(), 7, until).means) == left
+
+
+def test_a_run_without_the_phase_has_its_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "SCHEDULE", replace(SCHEDULE, prune_end=10))
+    assert len(selected(random_splats(20), SplatSelection(), 7).means) == 7
 
 
 class Late(SplatSelection):
