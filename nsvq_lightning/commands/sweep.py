@@ -139,7 +139,9 @@ def plan(options: Namespace) -> list[Run]:
     for scene in filter(None, options.scenes):
         if not Path(scene).is_dir():
             raise ValueError(f"{scene} is no folder; --scenes takes COLMAP folders with commas between them")
-    common = [*options.further, "--trainer.logger=false", *_given({"trainer.max_steps": options.max_steps})]
+    common = [*options.further, "--trainer.logger=false"]
+    if steps := options.max_steps:
+        common += [f"--trainer.max_steps={steps}", "--callbacks.phases.iterations_per_photo=null"]
     runs: list[Run] = []
     for config in options.configs:
         arguments = [*_given({"config": config}), *common]
@@ -219,13 +221,12 @@ def prepare(run: Run) -> list[str]:
     run.folder.mkdir(parents=True, exist_ok=True)
     hold(run.folder)
     try:
-        begun = (run.folder / CHECKPOINT).is_file()
+        begun, config = (run.folder / CHECKPOINT).is_file(), run.folder / "config.yaml"
         if not begun:
             for path in map(run.folder.joinpath, RUN_FILES):
                 rmtree(path, ignore_errors=True)
                 path.unlink(missing_ok=True)
-        config = run.folder / "config.yaml"
-        write_text(config, run.config)
+            write_text(config, run.config)  # a run that has begun notes there how many iterations its minutes are
     finally:
         let_go(run.folder)
     arguments = ["fit", "--config", str(config), f"--trainer.run_folder={run.folder}"]

@@ -104,6 +104,14 @@ def test_the_short_options_of_fit_hold_for_every_run(scenes: tuple[str, str]) ->
         planned(f"--scenes={scenes[0]}", "--splats=3000", "--bytes=100000")
 
 
+def test_iterations_are_those_asked_for_however_few_photos_there_are(scenes: tuple[str, str]) -> None:
+    for more, expected in (((), (4500, 20)), (("--max-steps=4400",), (4400, None))):
+        (run,) = planned(f"--scenes={scenes[0]}", *more)
+        config = yaml.safe_load(run.config)
+        phases = config["callbacks"]["phases"]["init_args"]
+        assert (config["trainer"]["max_steps"], phases["iterations_per_photo"]) == expected
+
+
 def test_what_cannot_be_is_said_at_once(scenes: tuple[str, str], tmp_path: Path) -> None:
     fox = f"--scenes={scenes[0]}"
     with pytest.raises(ValueError, match="choose one of 16k"):
@@ -293,8 +301,11 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint(
             sweep(tmp_path, [first])
     assert not (tmp_path / "results.csv").exists()
     own = f"--ckpt_path={first.folder / 'checkpoints' / 'last.ckpt'}"
+    config = first.folder / "config.yaml"
+    config.write_text(begun := config.read_text() + "# iterations of its minutes\n")
     (line,) = commands([first])
     assert shlex.split(line)[-1] == own
+    assert config.read_text() == begun
     with in_process() as calls:
         (row,) = sweep(tmp_path, [first], keep_checkpoints=True)
     assert [call[-1] for call in calls] == [own]

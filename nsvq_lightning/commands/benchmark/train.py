@@ -147,6 +147,7 @@ def _train(scope: Scope, clock: StepClock) -> None:
                 *data,
                 f"--trainer.default_root_dir={folder}",
                 f"--trainer.max_steps={scope.steps}",
+                "--callbacks.phases.iterations_per_photo=null",
                 "--trainer.enable_progress_bar=false",
                 "--trainer.enable_checkpointing=false",
                 *(f"--callbacks.{name}=null" for name in WATCHING),
