@@ -101,6 +101,8 @@ def run(options: Namespace) -> int:
         wrong = f"{options.output}: the result is a .nsvq file or {NAME}; 'nsvq convert' writes other formats"
     elif streamed and (options.codebooks or options.max_error or options.target_bytes):
         wrong = f"{NAME} has levels of detail (--levels), no codebooks and no limits"
+    elif options.output.is_dir():
+        wrong = f"{options.output} is a folder: name a file"
     elif options.levels and not streamed:
         wrong = f"--levels is for {NAME}, but the output is {options.output}"
     if wrong:
@@ -109,6 +111,7 @@ def run(options: Namespace) -> int:
     most = splats_left(options.splats, len(scene))
     from nsvq_lightning.compression.compressor import Compressor
 
+    make_folder_of(options.output)  # now, not after the training
     given = [] if photos else cameras
     compressor = Compressor(scene, given, photos, Storage(options.level), options.seed, options.minutes, options.steps)
     if streamed:
@@ -135,7 +138,6 @@ def _write_levels(options: Namespace, compressor: "Compressor", most: int) -> No
 def _write_file(options: Namespace, compressor: "Compressor", most: int, views: str) -> None:
     """Write the ``.nsvq`` file of at most ``most`` splats that is asked for."""
     candidate = compressor.best(most, options.codebooks, options.target_bytes, options.max_error)
-    make_folder_of(options.output)
     write_bytes(options.output, candidate.data)
     before, after = compressor.scene.stored_bytes or 0, len(candidate.data)
     sizes = candidate.setting.codebooks

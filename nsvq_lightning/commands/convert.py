@@ -111,6 +111,8 @@ def _contradiction(options: Namespace) -> str:
         return "--measure compares with the input as it is: convert without it first"
     if options.measure and options.output.exists() and options.output.samefile(options.inputs[0]):
         return "--measure compares with the input, which would be overwritten: name another output"
+    if len(options.inputs) > 1 and options.output.is_file():
+        return f"{options.output} exists, and may be one of those to be joined: name another output, or remove it"
     if options.splats and len(options.inputs) > 1:
         return "--splats asks the pictures of one scene: thin each scene before they are joined"
     for name, suffixes in WRITER_OPTIONS.items():

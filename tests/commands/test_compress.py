@@ -187,6 +187,20 @@ def test_wrong_options_end_with_status_2(
     assert message in capsys.readouterr().err
 
 
+def test_an_output_that_cannot_be_written_is_told_before_the_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_ply(tmp_path / "scene.ply", ball(300))
+    (tmp_path / "folder.nsvq").mkdir()
+    monkeypatch.setattr("nsvq_lightning.compression.compressor.Compressor", None)
+    assert main(["compress", str(tmp_path / "scene.ply"), str(tmp_path / "scene.ply" / "x.nsvq")]) == 1
+    assert "scene.ply: File exists" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as stop:
+        main(["compress", str(tmp_path / "scene.ply"), str(tmp_path / "folder.nsvq")])
+    assert stop.value.code == 2
+    assert "is a folder: name a file" in capsys.readouterr().err
+
+
 def test_levels_end_where_they_would_be_alike(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_ply(tmp_path / "scene.ply", ball(20, degree=0))
     paths = str(tmp_path / "scene.ply"), str(tmp_path / "lod" / "lod-meta.json")

@@ -190,6 +190,11 @@ def test_scenes_are_joined_moved_and_lose_bands(tmp_path: Path) -> None:
     scales = np.concatenate([part.scales for part in parts])
     np.testing.assert_allclose(both.values("scales"), scales + np.log(2), rtol=1e-5, atol=1e-5)
     assert (both.sh_degree, both.values("shN").shape) == (1, (50, 3, 3))
+    before = (tmp_path / "c.ply").read_bytes()
+    with pytest.raises(SystemExit) as stop:
+        main(files)
+    assert stop.value.code == 2
+    assert (tmp_path / "c.ply").read_bytes() == before
 
 
 def test_scenes_with_codebooks_keep_them_when_joined(tmp_path: Path) -> None:
