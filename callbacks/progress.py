@@ -1,7 +1,9 @@
 """The progress of a whole run: a bar on a terminal, plain lines in a file."""
 
+import logging
 import sys
 import time
+from io import StringIO
 from typing import Any
 
 from lightning.pytorch import Trainer
@@ -11,6 +13,7 @@ from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
 from nsvq_lightning.compute.jit import compile_seconds
 from nsvq_lightning.training.module import SplatModule
 
+log = logging.getLogger(__name__)
 # Lines of a run if the output is not a terminal.
 LINES = 50
 # Weight of the past in the exponential mean of the training PSNR.
@@ -82,12 +85,16 @@ class SplatProgressBar(TQDMProgressBar):
             left = seconds * (total - done) / max(1.0, done - self.train_progress_bar.initial)
             end = time.strftime("%H:%M", time.localtime(time.time() + left))
             times = f"{Tqdm.format_interval(seconds)} elapsed, {Tqdm.format_interval(left)} left, until {end}"
-            sys.stdout.write(f"iteration {done} of {total} ({100 * done // total} %), {times}: {text}\n")
-            sys.stdout.flush()
+            try:
+                sys.stdout.write(f"iteration {done} of {total} ({100 * done // total} %), {times}: {text}\n")
+                sys.stdout.flush()
+            except OSError as error:  # nobody reads any more
+                log.warning("the progress cannot be shown any more (%s); the run goes on", error)
+                sys.stdout = StringIO()
             return
         bar = self.train_progress_bar
         bar.start_t = self._start + compile_seconds()
-        bar.n = done
+        bar.n, bar.total = done, trainer.max_steps
         bar.set_postfix_str(text)
 
     def on_train_epoch_end(self, trainer: Trainer, module: SplatModule) -> None:

@@ -73,3 +73,24 @@ def test_what_is_no_terminal_gets_lines(monkeypatch: pytest.MonkeyPatch, tmp_pat
         monkeypatch.setitem(sys.modules, "ipykernel", jit)
         bar.setup(Trainer(logger=False, max_steps=9), SplatModule(), "test")
         assert not bar.is_disabled
+
+
+class Closed(io.StringIO):
+    """A pipe whose reader has gone."""
+
+    def write(self, text: str) -> int:
+        raise BrokenPipeError(32, "Broken pipe")
+
+
+def test_a_run_goes_on_where_nobody_reads_its_lines(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(sys, "stdout", Closed())
+    bar = SplatProgressBar(refresh_rate=1)
+    trainer = Trainer(logger=False, max_steps=9, default_root_dir=tmp_path)
+    module = SplatModule()
+    bar.setup(trainer, module, "fit")
+    bar.on_train_start(trainer, module)
+    for _ in range(2):
+        bar.on_train_batch_end(trainer, module, None)
+    assert caplog.text.count("the progress cannot be shown any more") == 1
