@@ -40,7 +40,8 @@ class PhaseSchedule(SplatCallback):
     """
 
     total: int | None = None
-    """Iterations of the run; None takes ``trainer.max_steps``."""
+    """Iterations that the phases are laid out for; None takes ``trainer.max_steps``, which ends the run in any case:
+    where it is larger, the last phase goes on."""
     reference_total: int | None = 15_000
     """Iterations of the run that the ends are given for; None means ``total``: nothing scales."""
     warmup_end: int = 8000
@@ -144,7 +145,7 @@ class PhaseSchedule(SplatCallback):
             )
         self._steps = trainer.max_steps if trainer.max_steps >= 0 else total
         module.schedule = self.schedule(total)
-        if 0 < trainer.max_steps < total:
+        if trainer.max_steps > 0 and module.schedule.phase_at(trainer.max_steps) < module.schedule.phase_at(total):
             log.warning(
                 f"trainer.max_steps={trainer.max_steps} ends this run in its "
                 f"{module.schedule.phase_at(trainer.max_steps).name.lower()} phase, the schedule has {total}: the "

@@ -67,8 +67,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if os.environ.get(TRACEBACK) or not lacks_memory:
             raise
         return _failed(
-            "error: there is not enough memory: close other programs, or take fewer splats (--splats), smaller photos "
-            f"(--data.factor) or a smaller scene ({TRACEBACK}=1 shows where)"
+            "error: there is not enough memory: close other programs, take a smaller scene or picture, and for a fit "
+            f"fewer splats (--splats) or smaller photos (--data.factor) ({TRACEBACK}=1 shows where)"
         )
     except ModuleNotFoundError as error:
         if error.name != "cv2":

@@ -28,10 +28,10 @@ SHORTHANDS = {
 
 
 def joined(arguments: Sequence[str]) -> list[str]:
-    """The arguments, each option together with its value (``--a=1`` for ``--a 1``), ``-c`` as ``--config``."""
+    """The arguments, each option together with its value (``--a=1`` for ``--a 1``), ``-c`` and ``-h`` in full."""
     found: list[str] = []
     for argument in arguments:
-        option = re.sub(r"^-c(?==|$)", "--config", argument)
+        option = re.sub(r"^-h$", "--help", re.sub(r"^-c(?==|$)", "--config", argument))
         waits = found and found[-1].startswith("--") and "=" not in found[-1] and found[-1] != "--help"
         if waits and not option.startswith("--"):
             found[-1] += f"={option}"

@@ -19,6 +19,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from shutil import copyfileobj
 from tempfile import TemporaryDirectory
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -83,7 +84,8 @@ def run(options: Namespace) -> int:
             address = f"http://{options.host}:{server.server_port}/"
             say(f"{title} is at {address} until Ctrl-C")
             if options.open:
-                webbrowser.open(address)
+                # A browser in this terminal returns when it is left.
+                Thread(target=webbrowser.open, args=(address,), daemon=True).start()
             server.serve_forever()
     return 0
 

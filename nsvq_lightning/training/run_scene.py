@@ -60,7 +60,7 @@ def train_contributions(trainer: Trainer, trained: SplatScene) -> Tensor:
     Raises:
         ValueError: The trainer has no data module with a scene.
     """
-    scene = needed_scene(trainer, "contributions of splats need the train views", "leave weights by contribution off")
+    scene = needed_scene(trainer, "contributions of splats need the train views", "take CodebookInit(weighted=False)")
     cameras = scene.train_cameras[trainer.global_rank :: trainer.world_size]
     return sum_over_processes(trainer, contributions(trained.splats, cameras, trained.render))
 

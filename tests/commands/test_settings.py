@@ -22,7 +22,7 @@ from nsvq_lightning.commands.settings import (
 
 
 def test_an_option_and_its_value_become_one_argument() -> None:
-    arguments = ["fit", "--a", "1", "--b=2", "3", "-c", "x", "-c=y", "--help", "z", "--last"]
+    arguments = ["fit", "--a", "1", "--b=2", "3", "-c", "x", "-c=y", "-h", "z", "--last"]
     assert joined(arguments) == ["fit", "--a=1", "--b=2", "3", "--config=x", "--config=y", "--help", "z", "--last"]
 
 
