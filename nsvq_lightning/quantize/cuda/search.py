@@ -34,6 +34,12 @@ kernel_of_any_count = triton.jit(do_not_specialize=["count"])
 
 
 @triton.jit
+def places(SIZE: tl.constexpr):
+    """The numbers ``[SIZE]`` of what this program works on, where each program has as many."""
+    return tl.program_id(0).to(tl.int64) * SIZE + tl.arange(0, SIZE)
+
+
+@triton.jit
 def compare(x, at, codebook, num_codes, code_stride, DIM: tl.constexpr, WITH_SECOND: tl.constexpr):
     """Compare rows with all codes ``[DIM, code_stride]``, which are infinite beyond ``num_codes``.
 
@@ -71,7 +77,7 @@ def least_of(smallest, chosen, num_codes):
 @kernel_of_any_count
 def nearest_kernel(x, codebook, result, count, num_codes, code_stride, DIM: tl.constexpr):
     """Nearest code of each row ``[count, DIM]``."""
-    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    row = places(ROWS)
     at = tl.minimum(row, tl.cast(count, tl.int64) - 1) * DIM
     smallest, chosen, _ = compare(x, at, codebook, num_codes, code_stride, DIM, False)
     _, nearest = least_of(smallest, chosen, num_codes)
@@ -144,11 +150,11 @@ def bound_below(squared):
 @triton.jit
 def drift_kernel(codebook, snapshot, squared_drift, num_codes, DIM: tl.constexpr):
     """Raise ``squared_drift[0]``, the bits of a float32, to how far any of the codes has moved since the snapshot."""
-    code = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    code = places(BLOCK)
     inside = code < num_codes
     squared = tl.zeros([BLOCK], tl.float32)
     for j in range(DIM):
-        at = code.to(tl.int64) * DIM + j
+        at = code * DIM + j
         step = tl.load(codebook + at, mask=inside, other=0.0) - tl.load(snapshot + at, mask=inside, other=0.0)
         squared = tl.fma(step, step, squared)
     # A code that is not a number may have been anywhere. The largest is the same in whatever order programs end.
@@ -172,7 +178,7 @@ def have_jumped(ends, count):
 def snapshot_kernel(codebook, snapshot, travelled, squared_drift, ends, count, size):
     """Take a snapshot of the codes, if they have jumped."""
     if have_jumped(ends, count):
-        place = tl.program_id(0) * COPIED + tl.arange(0, COPIED)
+        place = places(COPIED)
         tl.store(snapshot + place, tl.load(codebook + place, mask=place < size, other=0.0), mask=place < size)
         if tl.program_id(0) == 0:
             tl.store(travelled, tl.load(travelled) + drift_of(squared_drift))
@@ -181,7 +187,7 @@ def snapshot_kernel(codebook, snapshot, travelled, squared_drift, ends, count, s
 @kernel_of_any_count
 def queue_kernel(ends, queue, count):
     """Line up the places at which the running sum ``ends`` rises."""
-    place = tl.program_id(0).to(tl.int64) * COPIED + tl.arange(0, COPIED)
+    place = places(COPIED)
     end = tl.load(ends + place, mask=place < count, other=0)
     before = tl.load(ends + place - 1, mask=(place < count) & (place > 0), other=0)
     tl.store(queue + before, place.to(tl.int32), mask=end > before)
@@ -196,7 +202,7 @@ def check_kernel(
 
     ``travelled`` is how far the codes have moved by the last snapshot, ``squared_drift`` since.
     """
-    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    place = places(BLOCK)
     inside = place < count
     row = tl.load(rows + place, mask=inside, other=0)
     code = tl.load(last + row, mask=inside, other=-1)

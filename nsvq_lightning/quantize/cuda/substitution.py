@@ -18,6 +18,7 @@ from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.compute.rows import sorted_by_key
 from nsvq_lightning.quantize import substitution
+from nsvq_lightning.quantize.cuda.search import places
 
 SPLIT = tl.constexpr(0x3F3504F3)  # bits of 1/√2: a mantissa lies in [1/√2, √2)
 TWO_LOG2_E = tl.constexpr(2 / math.log(2))
@@ -84,7 +85,7 @@ def chosen_rows(
 
     A row outside the table, or whose code is outside the codebook, is NaN; raising an error would need a sync.
     """
-    i = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)[:, None]
+    i = places(ROWS)[:, None]
     column = tl.arange(0, WIDTH)[None, :]
     inside = (i < count) & (column < DIM)
     row = tl.load(rows + i, mask=i < count, other=0)
@@ -243,8 +244,7 @@ def _remembered(codes: Tensor, num_codes: int) -> tuple[Tensor, Tensor]:
     if known != state:
         found = sorted_by_key(codes, num_codes)
         _sorted[codes] = state, found
-    order, starts = found
-    return order, starts
+    return found  # type: ignore[no-any-return]
 
 
 def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) -> Tensor:

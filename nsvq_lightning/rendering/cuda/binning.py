@@ -14,6 +14,7 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.compute.rows import sorted_by_key
+from nsvq_lightning.rendering.cuda.harmonics import places
 
 
 class Tiles(NamedTuple):
@@ -37,7 +38,7 @@ class Tiles(NamedTuple):
 @triton.jit(do_not_specialize=["total", "count", "halvings"])
 def expand_kernel(boxes, ends, keys, owners, total, count, halvings, columns, BLOCK: tl.constexpr):
     """The tile and the splat of every pair; a splat's pairs end at ``ends``."""
-    pair = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    pair = places(BLOCK)
     inside = pair < total
     low, high = tl.zeros([BLOCK], tl.int32), tl.zeros([BLOCK], tl.int32) + count
     for _ in range(halvings):

@@ -20,7 +20,7 @@ from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.rendering import formulas as shared
 from nsvq_lightning.rendering.cuda import records as rec
 from nsvq_lightning.rendering.cuda.binning import Tiles
-from nsvq_lightning.rendering.cuda.harmonics import load_row, store_row
+from nsvq_lightning.rendering.cuda.harmonics import load_row, places, store_row
 from nsvq_lightning.rendering.cuda.projection import Lens
 
 formulas = for_triton(shared)
@@ -175,7 +175,7 @@ def total_kernel(
 
     ``WITH_ABSGRAD`` also writes the absolute gradients: Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · pixel weight over pixels.
     """
-    rank = tl.program_id(0).to(tl.int64) * SPLATS + tl.arange(0, SPLATS)
+    rank = places(SPLATS)
     seen = rank < count
     end = tl.load(slot_ends + rank, mask=seen, other=0)
     begin = tl.load(slot_ends + rank - 1, mask=seen & (rank > 0), other=0)

@@ -13,6 +13,12 @@ formulas = for_triton(shared)
 
 
 @triton.jit
+def places(SIZE: tl.constexpr):
+    """The numbers ``[SIZE]`` of what this program works on, where each program has as many."""
+    return tl.program_id(0).to(tl.int64) * SIZE + tl.arange(0, SIZE)
+
+
+@triton.jit
 def load_row(pointer, count, mask):
     """Consecutive floats at each of the pointers."""
     values = ()

@@ -14,7 +14,7 @@ from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.rendering import formulas as shared
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda import records as rec
-from nsvq_lightning.rendering.cuda.harmonics import color, color_backward, load_row, store_row
+from nsvq_lightning.rendering.cuda.harmonics import color, color_backward, load_row, places, store_row
 from nsvq_lightning.rendering.sampling import ViewSampling
 from nsvq_lightning.splats.attributes import attribute_shapes
 from nsvq_lightning.splats.splats import sh_degree_of
@@ -67,7 +67,7 @@ def project_kernel(
     records, boxes, means2d, radii, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Records, tile boxes and centres of the splats in view at their own rows; radii, 0 for the rest."""
-    row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    row = places(BLOCK)
     inside = row < n
     mean, quat, scale = load_geometry(means, quats, scales, row, inside)
     logit = tl.load(logits + row, mask=inside, other=0.0)
@@ -103,7 +103,7 @@ def project_backward_kernel(
 
     Rows are written in their order, those out of view (of rank -1) with zeros: reads as 0 make all that follows 0.
     """
-    row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    row = places(BLOCK)
     inside = row < n
     rank = tl.load(ranks + row, mask=inside, other=-1).to(tl.int64)
     seen = rank >= 0
@@ -138,7 +138,7 @@ def project_backward_kernel(
 @triton.jit(do_not_specialize=["n"])
 def take_kernel(table, ids, n, taken, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
     """Rows ``ids`` of a table; torch's own indexing takes ten times as long for rows of whole 16-byte words."""
-    place, field = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, 16)
+    place, field = places(BLOCK), tl.arange(0, 16)
     row = tl.load(ids + place, mask=place < n, other=0)
     wanted = (place < n)[:, None] & (field < WIDTH)[None]
     found = tl.load(table + row[:, None] * WIDTH + field, mask=wanted)
