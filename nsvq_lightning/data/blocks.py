@@ -63,7 +63,7 @@ class Block:
         """
         ground = points @ np.array(self.axes).T
         low, high = self.around if around else self.core
-        return np.asarray(((ground >= low) & (ground < high)).all(1))
+        return ((ground >= low) & (ground < high)).all(1)  # type: ignore[no-any-return]
 
     @classmethod
     def read(cls, folder: Path) -> "Block":

@@ -209,8 +209,7 @@ def model_files(root: Path, chosen: str | None = None) -> dict[str, Path]:
     folders: Sequence[str] = FOLDERS
     if chosen is not None:
         folders = [f"sparse/{chosen}" if chosen.isdecimal() else chosen]
-    files = find_model(root, folders)
-    if files is not None:
+    if files := find_model(root, folders):
         return files
     others = other_models(root) if chosen is None else []
     if not others:
@@ -394,7 +393,7 @@ def alignment(model: ColmapModel, other: ColmapModel) -> Float64s:
                 f"{len(shared)} photos of the same name are in both scenes: to align them takes three that were not "
                 "taken from one line"
             )
-    return np.asarray(import_pycolmap().estimate_sim3d(ours, theirs).matrix())
+    return import_pycolmap().estimate_sim3d(ours, theirs).matrix()  # type: ignore[no-any-return]
 
 
 def _no_model(root: Path, folders: Sequence[str], chosen: str | None) -> SceneError:
@@ -418,8 +417,7 @@ def larger_models(root: Path) -> str | None:
     """
     counts = {}
     for folder in (root / "sparse").glob("*"):
-        files = _tables_in(folder)
-        if files is not None:
+        if files := _tables_in(folder):
             with suppress(ValueError, OSError):
                 counts[folder.name] = len(tables.read_images(files["images"]))
     first = counts.get("0", math.inf)

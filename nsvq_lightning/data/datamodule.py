@@ -152,7 +152,7 @@ class SceneDataModule(LightningDataModule):
     @property
     def process(self) -> tuple[int, int]:
         """Rank of this process and their number; ``(0, 1)`` without a trainer."""
-        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer is not None else (0, 1)
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
     @property
     def draw(self) -> int:
@@ -162,8 +162,8 @@ class SceneDataModule(LightningDataModule):
         """
         if self.trainer is None:
             return 0
-        total = self.trainer.fit_loop.epoch_loop.batch_progress.total
-        drawn = int(total.processed)  # type: ignore[attr-defined]  # Lightning types the base of its counters
+        # Lightning types the base of its counters.
+        drawn = int(self.trainer.fit_loop.epoch_loop.batch_progress.total.processed)  # type: ignore[attr-defined]
         repeated = int(self.trainer.overfit_batches)  # type: ignore[attr-defined]
         return drawn % repeated if repeated else drawn
 

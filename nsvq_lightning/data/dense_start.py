@@ -53,7 +53,7 @@ class _Photo(NamedTuple):
     def rays(self, pixels: Float64s) -> Float64s:
         """Unit directions ``[M, 3]`` in the world of pixels ``[M, 2]``."""
         local = np.c_[(pixels - self.centre) / self.focal, np.ones(len(pixels))]
-        return np.asarray(local / np.linalg.norm(local, axis=1, keepdims=True) @ self.rotation)
+        return local / np.linalg.norm(local, axis=1, keepdims=True) @ self.rotation  # type: ignore[no-any-return]
 
 
 # Candidates over all flows; of more pixels than that, every third, fourth, ... row and column is taken.

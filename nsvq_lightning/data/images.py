@@ -31,10 +31,14 @@ DAMAGED = (OSError, ValueError, SyntaxError, KeyError, TypeError, struct.error, 
 ON_ITS_SIDE = 5
 
 
+# Width and height in pixels.
+Size = tuple[int, int]
+
+
 class ImageHead(NamedTuple):
     """What the head of an image file says: width and height in pixels as stored, EXIF orientation, transparency."""
 
-    size: tuple[int, int]
+    size: Size
     orientation: int
     has_alpha: bool
 
@@ -63,12 +67,12 @@ def image_head(path: Path) -> ImageHead:
 ROUNDED = 0.01
 
 
-def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+def same_shape(one: Size, other: Size) -> bool:
     """Whether two sizes (width, height) have one aspect ratio, up to rounding of a side to a pixel of the first."""
     return abs(one[0] * other[1] - one[1] * other[0]) < max(ROUNDED * one[1] * other[0], *other)
 
 
-def head_for(path: Path, expected: tuple[int, int], as_shown: bool = False) -> ImageHead:
+def head_for(path: Path, expected: Size, as_shown: bool = False) -> ImageHead:
     """The head of a photo for a camera of some size: with the orientation to apply, and the size that it then has.
 
     Args:
@@ -98,7 +102,7 @@ def read_image(path: Path) -> Uint8s:
         SceneError: The file is damaged or has floating-point pixels.
     """
     pixels = _to_bytes(_decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))
-    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
+    return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)  # type: ignore[no-any-return]
 
 
 def _decoded(path: Path, flags: int) -> Arrays:
@@ -169,7 +173,7 @@ def _turned_back(pixels: Arrays, orientation: int) -> Arrays:
     return np.ascontiguousarray(pixels)
 
 
-def read_mask(path: Path, size: tuple[int, int]) -> Bools:
+def read_mask(path: Path, size: Size) -> Bools:
     """Which pixels of a photo count ``[H, W]``: those that are more than half as bright as the brightest.
 
     So white and 1 are kept, in 8 or 16 bits, black is excluded. Where pixels are transparent, that is the mask; in
@@ -201,7 +205,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bools:
     return np.asarray(cv2.resize(bright.view(np.uint8), size, interpolation=cv2.INTER_NEAREST), bool)
 
 
-def resized(image: Uint8s, kept: Bools | None, size: tuple[int, int]) -> tuple[Uint8s, Bools | None]:
+def resized(image: Uint8s, kept: Bools | None, size: Size) -> tuple[Uint8s, Bools | None]:
     """A picture made ``size`` (width, height), and which of its pixels count: those all of whose sources do."""
     if image.shape[1::-1] == size:
         return image, kept
@@ -246,7 +250,7 @@ class ImageSource:
     """
 
     path: Path
-    size: tuple[int, int]
+    size: Size
     undistortion: Undistortion | None
     pinhole: Pinhole
     orientation: int = 1
@@ -274,10 +278,10 @@ class ImageSource:
         height, width = image.shape[:2]
         if (width, height) != self.size:
             raise _undecodable(self.path, f"decoded to {width}x{height}, its head says {self.size[0]}x{self.size[1]}")
-        if self.mask is not None:
+        if self.mask:
             mask = read_mask(self.mask, self.size)
             kept = mask if kept is None else kept & mask
-        if self.undistortion is not None:
+        if self.undistortion:
             image, kept = self.undistortion(image, kept)
         image, kept = resized(image, kept, (self.pinhole.width, self.pinhole.height))
         if kept is None or kept.all():
@@ -395,7 +399,7 @@ class ImageStore:
         if index in self._kept:
             return self._kept[index]
         coming = self._coming.pop(index, None)
-        picture = coming.result() if coming is not None else self.sources[index].load()
+        picture = coming.result() if coming else self.sources[index].load()
         if picture.nbytes <= self._free:
             self._kept[index] = picture
             self._free -= picture.nbytes

@@ -65,9 +65,8 @@ def locate(
         used[path] = name
     stems = {path.with_suffix("") for path in taken | used.keys()}
     kinds = {_kind(path.name) for path in free if path not in used and path.with_suffix("") in stems}
-    for path, name in list(used.items()):
-        if _kind(path.name) in kinds - {_kind(name)}:  # such as depth maps beside all photos, of which one is gone
-            del used[path]
+    # Not of another kind that lies beside all photos, such as the depth map of a photo that is gone.
+    used = {path: name for path, name in used.items() if _kind(path.name) not in kinds - {_kind(name)}}
     paths |= {name: path for path, name in used.items()}
     if used:
         path, name = next(iter(used.items()))
@@ -143,7 +142,7 @@ def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]
         SceneError: Several have.
     """
     scaled = root / f"{name}_{factor}"
-    if factor is not None and factor > 1 and scaled.is_dir():
+    if factor and factor > 1 and scaled.is_dir():
         return scaled, 1
     if (root / name).is_dir():
         return root / name, factor or 1
@@ -181,7 +180,7 @@ def find_masks(
         SceneError: A mask that the model names does not exist, or two files fit a photo.
     """
     given = [image.mask for image in images]
-    if lost := [path for path in given if path is not None and not path.is_file()]:
+    if lost := [path for path in given if path and not path.is_file()]:
         raise SceneError(f"{len(lost)} masks do not exist, first {lost[0]}: copy them, or remove mask_path")
     relative = [str(path.relative_to(photos)) if path.is_relative_to(photos) else path.name for path in files]
     named = [(image.name, name) for image, name in zip(images, relative, strict=True)]

@@ -99,7 +99,7 @@ def random_points(cameras: list[Camera]) -> Float64s:
     points = centres[chosen] + rotations[chosen].apply(rays * (2 * distance * away)[:, None])
     # One after another: all pictures at once would take a byte for each point and camera.
     sightings = sum(in_picture(points, camera).astype(int) for camera in cameras)
-    return np.asarray(points[np.argsort(-sightings, kind="stable")[:RANDOM_POINTS]])
+    return points[np.argsort(-sightings, kind="stable")[:RANDOM_POINTS]]  # type: ignore[no-any-return]
 
 
 def in_picture(points: Float64s, camera: Camera) -> Bools:

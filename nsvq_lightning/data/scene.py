@@ -559,7 +559,7 @@ def astray(places: Float64s, times: float) -> Bools:
     middle, usual = middle_of(finite)
     with np.errstate(invalid="ignore"):
         distances = np.linalg.norm(places - middle, axis=1)
-    return np.asarray((distances > times * usual) & (usual > 0))
+    return (distances > times * usual) & (usual > 0)  # type: ignore[no-any-return]
 
 
 def _camera(image: ColmapImage, lens: Pinhole, near: float) -> Camera:

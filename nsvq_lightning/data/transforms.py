@@ -343,7 +343,7 @@ def _points(
     if isinstance(name, str):
         check_name(_plain(name), f"ply_file_path in {root}", allow_outside)
         path: Path | None = root / _plain(name)
-    elif (path := cloud_in([root])) is not None:
+    elif path := cloud_in([root]):
         log.info("%s names no points: those of %s are used", root, path)
     if path is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)

@@ -96,7 +96,7 @@ class Undistortion:
             Source column and row ``[H, W]``, in OpenCV's pixels (centres at integers), and which pixels the camera
             never saw.
         """
-        if self._maps is not None:
+        if self._maps:
             return self._maps
         pixels = self._source_pixels()
         # a pixel or more from the centres of the border, or NaN where the ray leaves the domain of the camera model
