@@ -104,7 +104,7 @@ def save(scene: "AnySplats", path: StrPath, storage: Storage | str | None = None
     storage = None if storage is None else Storage.of(storage)
     if entry.native:
         options["storage"] = storage
-    elif storage is not None:
+    elif storage:
         scene = as_stored(scene, storage)
     return entry.write(path, scene, **options)
 

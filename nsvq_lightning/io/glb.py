@@ -214,10 +214,8 @@ def _splats(document: Json, data: memoryview, primitive: Json) -> CompressedScen
     shown = values(OPACITY if OPACITY in names else "COLOR_0")
     # Without alpha, colours are opaque.
     rows["opacities"] = logits_of(np.ones(len(shown)) if shown.shape[1] == 3 else shown[:, -1])
-    if _harmonic(0) in names:
-        rows["sh0"] = values(_harmonic(0))
-    else:
-        rows["sh0"] = (values("COLOR_0")[:, :3] - 0.5) / SH_C0
+    base = _harmonic(0)
+    rows["sh0"] = values(base) if base in names else (values("COLOR_0")[:, :3] - 0.5) / SH_C0
     if degree:
         higher = [values(_harmonic(number + 1)) for number in range(sh_coefficients(degree))]
         rows["shN"] = np.concatenate(higher, axis=1)

@@ -29,7 +29,7 @@ def turn_up(up: Float64s, axis: str) -> Float64s:
     from scipy.spatial.transform import Rotation
 
     lift, _ = Rotation.align_vectors([0.0, -1.0, 0.0], up)
-    return np.asarray(UP_AXES[axis] @ lift.as_matrix())
+    return UP_AXES[axis] @ lift.as_matrix()  # type: ignore[no-any-return]
 
 
 # Half around z: right, down, front becomes left, up, front, the axes of glTF and USD.

@@ -437,7 +437,7 @@ def write_ply(path: StrPath, scene: CompressedScene) -> int:
             columns["shN"] = _by_color(columns["shN"])
             columns["unused"] = np.zeros((len(part), len(_UNUSED)), np.float32)
             table = np.concatenate([columns[name] for name in _ORDER], axis=1)
-            file.write(table.astype("<f4", copy=False).tobytes())
+            file.write(np.asarray(table, "<f4").tobytes())
         return file.tell()
 
 
@@ -503,7 +503,7 @@ def write_elements(path: StrPath, elements: Mapping[str, NDArray[np.void]], anti
     with atomic_write(path) as file:
         file.write(_header({name: (len(rows), rows.dtype) for name, rows in elements.items()}, antialiased))
         for rows in elements.values():
-            file.write(rows.astype(rows.dtype.newbyteorder("<"), copy=False).tobytes())
+            file.write(np.asarray(rows, rows.dtype.newbyteorder("<")).tobytes())
         return file.tell()
 
 

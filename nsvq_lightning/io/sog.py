@@ -255,7 +255,7 @@ class _Archive:
         from scipy.interpolate import make_interp_spline  # slow to import
 
         log.warning("%d levels of %s are null: taken in line with those beside", len(levels) - len(known), attribute)
-        return np.asarray(make_interp_spline(known, levels[known], k=1)(np.arange(len(levels))))
+        return make_interp_spline(known, levels[known], k=1)(np.arange(len(levels)))  # type: ignore[no-any-return]
 
     def colors(self) -> tuple[Float32s, Float32s]:
         """Constant coefficients ``[N, 3]`` and opacity logits ``[N]``."""

@@ -95,7 +95,7 @@ class SpzHeader:
     count: int
     sh_degree: int
     fraction_bits: int
-    flags: int = 0
+    flags: int
     system: int = 0
 
     @property

@@ -64,7 +64,9 @@ def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header
     Raises:
         ValueError: A value is too large for its step.
     """
-    with _workers() as pool:
+    # As many threads as torch uses; they run side by side because the kernels release the GIL. Tasks begin in the order
+    # in which they were submitted.
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         tasks = {name: pool.submit(rounded, scene, name, precision) for name in (*_EARLY, *_LONGEST_FIRST)}
         early = {name: tasks[name].result() for name in _EARLY}
         grid, doublings, depths = position_grid(scene.means, early, precision)
@@ -81,7 +83,7 @@ def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header
         streams = {
             "means": positions.result(),
             "means.grid": _GRID.pack(*grid.base, doublings),
-            "means.far": scene.means[far].astype("<f4", copy=False).tobytes(),
+            "means.far": np.asarray(scene.means[far], "<f4").tobytes(),
         }
         for task in writing:
             streams |= task.result()
@@ -105,7 +107,7 @@ def decode_compact(header: Header, streams: Mapping[str, Bytes]) -> CompressedSc
         raise FormatError(f"damaged: the cells of the positions have {doublings} doublings, not a finite number")
     grid = morton.Grid(entries["means"].step, tuple(base))
     far = np.frombuffer(streams["means.far"], "<f4").astype(np.float32).reshape(-1, 3)
-    with _workers() as pool:
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         two = header.version > 3
         early = {name: pool.submit(_decoded, entries[name], streams, _before(header.splats), two) for name in _EARLY}
         stored = {name: early[name].result() for name in _EARLY}
@@ -126,17 +128,8 @@ def decode_compact(header: Header, streams: Mapping[str, Bytes]) -> CompressedSc
             bases[name] = attribute.floats()
         else:
             raw[name] = attribute.floats()
-    middles = (np.arange(levels.entry.codes) + 0.5) / levels.entry.codes
-    opacities = logits_of(middles)[levels.values]
+    opacities = logits_of((np.arange(levels.entry.codes) + 0.5) / levels.entry.codes)[levels.values]
     return CompressedScene(means, opacities, codes, codebooks, raw, bases=bases, **header.of_scene)
-
-
-def _workers() -> ThreadPoolExecutor:
-    """As many threads as torch uses; they run side by side because the kernels release the GIL.
-
-    Tasks begin in the order in which they were submitted.
-    """
-    return ThreadPoolExecutor(max_workers=torch.get_num_threads())
 
 
 def _before(count: int) -> Int32s:

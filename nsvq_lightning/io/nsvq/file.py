@@ -70,9 +70,7 @@ def as_stored(scene: CompressedScene, storage: Storage) -> CompressedScene:
 
     A scene without codebooks stays as it is: rounding it would only cost quality, and its reference is the ``.ply``.
     """
-    if not scene.codes:
-        return scene
-    return decode(*encode(scene, storage))
+    return decode(*encode(scene, storage)) if scene.codes else scene
 
 
 def read_nsvq(path: StrPath) -> CompressedScene:
@@ -165,7 +163,7 @@ def encode_paper(scene: CompressedScene) -> tuple[Header, dict[str, bytes]]:
     coded = [entry for entry in header.attributes if entry.storage == "codes"]
     floats = {name: scene.rows(name) for name in ("means", "opacities", *scene.raw)}
     floats |= {f"{name}.codebook": values for name, values in scene.codebooks.items()}
-    streams = {name: values.astype("<f4", copy=False).tobytes() for name, values in floats.items()}
+    streams = {name: np.asarray(values, "<f4").tobytes() for name, values in floats.items()}
     if coded:
         streams["codes"] = pack_fields([scene.codes[entry.name] for entry in coded], [entry.bits for entry in coded])
     return header, streams

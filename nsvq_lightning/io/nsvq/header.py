@@ -29,6 +29,8 @@ from nsvq_lightning.splats.conventions import Float64s, Place
 # Magic, BLAKE2b digest of everything after it, version, and bytes of the JSON, whose keys are sorted, without spaces.
 _PREFIX = struct.Struct("<8s16sII")
 _T = TypeVar("_T")
+# A position and a focal length for each.
+_Cameras = tuple[tuple[float, ...], ...]
 # Types of the numbers of JSON; a bool is none.
 _NUMBERS = (int, float)
 # Its line ends and high bit expose transfers that treat it as text.
@@ -105,7 +107,7 @@ class Header:
     streams: tuple[StreamEntry, ...]
     config: Json = field(default_factory=dict)
     metrics: dict[str, float | None] = field(default_factory=dict)
-    cameras: tuple[tuple[float, ...], ...] = ()
+    cameras: _Cameras = ()
     version: int = VERSIONS[-1]
 
     @classmethod
@@ -223,7 +225,7 @@ def _origin(values: list[Any]) -> Place:
     return x, y, z
 
 
-def _cameras(rows: list[Any]) -> tuple[tuple[float, ...], ...]:
+def _cameras(rows: list[Any]) -> _Cameras:
     if len(rows) > MAX_CAMERAS or not all(_are_numbers(row, 4) and row[3] > 0 for row in rows):
         raise FormatError(f"damaged: header entry 'cameras' must be at most {MAX_CAMERAS} positions and focal lengths")
     return tuple(tuple(map(float, row)) for row in rows)
@@ -236,7 +238,7 @@ def _are_numbers(values: Any, count: int) -> bool:
     return all(type(value) in _NUMBERS and abs(value) <= sys.float_info.max for value in values)
 
 
-def _rounded(cameras: Float64s) -> tuple[tuple[float, ...], ...]:
+def _rounded(cameras: Float64s) -> _Cameras:
     """Cameras ``[C, 4]`` with the digits that count: positions to about a hundredth of their spread."""
     if len(cameras) == 0:
         return ()

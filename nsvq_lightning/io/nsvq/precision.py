@@ -53,11 +53,6 @@ class Precision:
         """Largest error of an attribute without a codebook; one that has no option has the error that it declares."""
         return float(getattr(self, name, ATTRIBUTES[name].error))
 
-    @property
-    def opacity_levels(self) -> int:
-        """Number of levels that the opacity has, at least 2."""
-        return math.ceil(0.5 / self.opacity)
-
 
 # Compression levels: ``compact`` is small; ``paper`` stores float32 values and whole bits, as the paper counts.
 LEVELS = ("compact", "paper")

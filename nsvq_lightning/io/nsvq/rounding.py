@@ -56,7 +56,7 @@ def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
         ValueError: A value is too large for its step.
     """
     if name == "opacities":
-        count = precision.opacity_levels
+        count = math.ceil(0.5 / precision.opacity)  # levels, at least 2
         values = np.minimum((opacity_of(scene.opacities) * count).astype(np.int64), count - 1)
         return Stored(AttributeEntry("opacities", 1, "levels", count), values)
     if name in scene.bases:
@@ -74,8 +74,7 @@ def rounded(scene: CompressedScene, name: str, precision: Precision) -> Stored:
 def _coded(name: str, codes: Integers, codebook: Float32s, error: float) -> Stored:
     used = np.bincount(codes, minlength=len(codebook)) > 0
     rows = codebook[used] if len(codes) else np.zeros_like(codebook[:1])
-    directions = unit(rows).astype(np.float32) if name == "quats" else rows
-    distinct = np.unique(directions, axis=0)
+    distinct = np.unique(unit(rows).astype(np.float32) if name == "quats" else rows, axis=0)
     step = _step(rows, 2 * error * sibling_distance(distinct[tree_order(distinct)]) or 2.0**-16)
     integers, merged = np.unique(_integers(name, rows, step), axis=0, return_inverse=True)
     merged_codes = merged.ravel()[np.cumsum(used)[codes] - 1]
