@@ -46,7 +46,7 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     if mask is not None:
         return 1 - mean_of_kept(1 - ssim(apply_mask(image, mask), apply_mask(target, mask)), mask)
     kernels = None if torch.is_grad_enabled() and image.requires_grad else _kernels(image, target)
-    if kernels is not None:
+    if kernels:
         loss: Tensor = kernels.fused_loss(image.contiguous(), target.contiguous(), 1.0, derived=False)[0]
         return (1 - loss).to(image)
     return plain_ssim(*in_range(image, target))
@@ -80,8 +80,7 @@ def photometric_loss(
         scaled = dssim_weight / max(float(mask.float().mean()), LEAST_ERROR)
         total = scaled + 1 - dssim_weight
         return total * photometric_loss(*masked, scaled / total, psnr=True)
-    kernels = _kernels(image, target)
-    if kernels is not None:
+    if kernels := _kernels(image, target):
         return _Loss.apply(image, target, dssim_weight, psnr, kernels)  # type: ignore[no-any-return, no-untyped-call]
     return plain_loss(image, target, dssim_weight, psnr=psnr)
 

@@ -1,7 +1,6 @@
 """Which attributes are quantized, with which codebooks, and a scene whose rows are replaced by their codes."""
 
 from collections.abc import Callable, Mapping
-from typing import cast
 
 import torch
 from torch import Generator, Tensor, nn
@@ -46,13 +45,12 @@ def build_quantizers(
 
 def attribute_rows(splats: RawSplats, attribute: str) -> Tensor:
     """Rows ``[N, D]`` of a quantized attribute, one vector per splat, detached."""
-    return cast(Tensor, getattr(splats, attribute)).detach().flatten(1)
+    return getattr(splats, attribute).detach().flatten(1)  # type: ignore[no-any-return]
 
 
 def codes_of(splats: RawSplats, attribute: str, quantizer: Quantizer) -> Tensor:
     """Codes ``[N]`` of an attribute: the frozen ones, those that are held, or the nearest ones now."""
-    held = held_codes(quantizer, len(splats.means))
-    if held is not None:
+    if (held := held_codes(quantizer, len(splats.means))) is not None:
         return held
     if len(quantizer.codes) == len(splats.means):
         return quantizer.codes
@@ -88,6 +86,6 @@ def noisy_rows(
             subset[name] = take_rows(tensor, rows)
             continue
         # Call the module, not its forward: hooks of user-made quantizers must run.
-        quantized, _ = cast(nn.Module, quantizers[name])(tensor.flatten(1), noise(name), rows)
+        quantized, _ = quantizers[name](tensor.flatten(1), noise(name), rows)  # type: ignore[operator]
         subset[name] = quantized.reshape(len(rows), *tensor.shape[1:])
     return RawSplats(**subset)

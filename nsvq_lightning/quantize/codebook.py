@@ -314,8 +314,7 @@ class CodebookQuantizer(nn.Module, ABC):
         if stored is not None and stored.dim() == 2 and stored.shape[1] == self.dim:
             self._resize(len(stored))
         for name in ("codes", "held"):
-            rows = state_dict.get(f"{prefix}{name}")
-            if rows is not None:
+            if (rows := state_dict.get(f"{prefix}{name}")) is not None:
                 setattr(self, name, self.codes.new_zeros(rows.shape))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
@@ -400,5 +399,5 @@ def as_quantizer(module: object) -> Quantizer:
 
 def held_codes(quantizer: object, count: int) -> Tensor | None:
     """The codes ``[count]`` that rows hold in training; None if they hold none, or are of another number."""
-    held: Tensor | None = getattr(quantizer, "held", None)
+    held = getattr(quantizer, "held", None)
     return held if held is not None and len(held) == count > 0 else None

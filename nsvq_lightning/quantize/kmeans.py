@@ -3,7 +3,7 @@
 Sums of rows by code, also the gradient of a codebook, have the same bits on any number of threads.
 """
 
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Generator, Tensor
@@ -64,7 +64,7 @@ def lookup(codebook: Tensor, codes: Tensor, x: Tensor | None = None, rows: Tenso
 
     With ``x [N, D]`` the gradient is also that of its rows ``rows [V]``, or of all of them: it passes straight through.
     """
-    return cast(Tensor, _Lookup.apply(codebook, codes, x, rows))
+    return _Lookup.apply(codebook, codes, x, rows)  # type: ignore[no-any-return]
 
 
 class _Lookup(torch.autograd.Function):
@@ -186,7 +186,6 @@ def rows_far_apart(rows: Tensor, count: int, generator: Generator) -> Tensor:
     while len(chosen) < count:
         far = draw_far_rows(rows, rows[chosen], min(len(chosen), count - len(chosen)), generator)
         if len(far) == 0:
-            rest = order[~torch.isin(order, chosen)]
-            return rows[torch.cat([chosen, rest[: count - len(chosen)]])]
+            return rows[torch.cat([chosen, order[~torch.isin(order, chosen)]])[:count]]
         chosen = torch.cat([chosen, far])
     return rows[chosen]

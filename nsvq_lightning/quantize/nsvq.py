@@ -1,7 +1,7 @@
 """Noise substitution in vector quantization (NSVQ, Vali and Bäckström 2022), and its relative DiVeQ."""
 
 import math
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Generator, Tensor
@@ -57,7 +57,7 @@ def noise_substitution(
     """
     seed = int(torch.randint(0, 2**63 - 1, (), dtype=torch.int64, device=generator.device, generator=generator))
     rows = torch.arange(len(x), device=x.device) if rows is None else rows
-    return cast(Tensor, _Substitution.apply(x, codebook, codes, rows, (seed, aim, spread)))  # type: ignore[no-untyped-call]
+    return _Substitution.apply(x, codebook, codes, rows, (seed, aim, spread))  # type: ignore[no-any-return, no-untyped-call]
 
 
 class _Substitution(torch.autograd.Function):

@@ -72,7 +72,7 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 def _steps(positions: Float64s, rotations: Rotation, unit: float) -> Float64s:
     """How far it is from each pose to the next, a turn by one radian counting as much as the distance ``unit``."""
     turns = (rotations[:-1].inv() * rotations[1:]).magnitude() if len(positions) > 1 else 0.0
-    return np.asarray(np.linalg.norm(np.diff(positions, axis=0), axis=1) / unit + turns)
+    return np.linalg.norm(np.diff(positions, axis=0), axis=1) / unit + turns  # type: ignore[no-any-return]
 
 
 def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:

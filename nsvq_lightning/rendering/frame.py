@@ -78,9 +78,7 @@ class Frame:
 
     def sampling(self, sampling: Sampling | None) -> Sampling | None:
         """The sampling of splats of the files, here."""
-        if sampling is None:
-            return None
-        return sampling._replace(distances=sampling.distances / self.unit)
+        return None if sampling is None else sampling._replace(distances=sampling.distances / self.unit)
 
     def splats(self, splats: SplatTensors) -> RawSplats:
         """Splats of the files, here; detached."""

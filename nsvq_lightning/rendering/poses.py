@@ -45,7 +45,7 @@ def up_of(cameras: Sequence[Camera]) -> Float64s:
     if np.linalg.norm(upper) < 0.3 and np.linalg.norm(forward) > 0.9:
         return np.asarray(-forward / np.linalg.norm(forward))
     if np.linalg.norm(upper) < 0.1:  # they are turned in all directions
-        return np.asarray(-axes[0, :, 1])
+        return -axes[0, :, 1]  # type: ignore[no-any-return]
     weights = np.ones(len(axes))
     for _ in range(20):  # weighted again by how level they are
         level = (weights * right.T) @ right / weights.sum()

@@ -136,5 +136,4 @@ def fewer_cameras(cameras: Float64s) -> Float64s:
     while len(chosen) < MAX_CAMERAS and apart.max() > NEAR_ENOUGH * spread:
         chosen.append(apart.argmax())
         apart = np.minimum(apart, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
-    kept: Float64s = cameras[np.sort(chosen)]
-    return kept
+    return cameras[np.sort(chosen)]  # type: ignore[no-any-return]

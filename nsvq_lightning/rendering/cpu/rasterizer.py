@@ -48,7 +48,6 @@ class _Frame:
         weakref.finalize(self, self.work.give_back)
         self.records = self.work.array("records", rec.RECORD * n)
         self.integers = self.records.view(np.int32)
-        self.sums = np.empty(0, np.float32)
 
     def find(self) -> tuple[Array, Array, Array]:
         """Write the records of the visible splats; returns a run of rows, and the rows and slots, of each part."""
