@@ -52,7 +52,7 @@ def evaluate(
     for view in views:
         view = view.to(sums.device)
         image = apply_mask(render(splats, view.camera).image, view.mask)
-        if show is not None:
+        if show:
             show(image, view.image)
             show = None
         pair = eight_bit(image), eight_bit(view.image)

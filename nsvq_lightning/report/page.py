@@ -50,10 +50,10 @@ def write_page(
     config = folder / "config.yaml"
     viewer = folder / "viewer.html"
     sections = {"Test views": _views(folder, views)}
-    if metrics is None and preview.exists():
+    if not metrics and preview.exists():
         sections["Photo and render"] = f'<img class="wide" alt="photo and render" src="{_jpeg(_read(preview))}">'
     sections["While it trained"] = _curve(history, schedule) if history else ""
-    if metrics is not None:
+    if metrics:
         sections |= {"Bytes": _streams(metrics), "Codes": _codes(metrics)}
     sections["Time"] = _times(history, seconds)
     if config.exists():

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar, cast
+from typing import TypeVar
 
 import torch
 import torch.distributed
@@ -98,7 +98,7 @@ def on_first_process(trainer: Trainer, make: Callable[[], T]) -> T:
     made = trainer.strategy.broadcast(made)
     if isinstance(made, Exception):
         raise made
-    return cast(T, made)
+    return made  # type: ignore[return-value]
 
 
 def from_first_process(trainer: Trainer, tensor: Tensor) -> Tensor:

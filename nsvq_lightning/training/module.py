@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
-from typing import Any, Literal, Self, cast
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
@@ -165,7 +165,6 @@ class SplatModule(LightningModule):
         self.stretches: Callable[[Schedule, int, int], list[tuple[float, int]]] | None = None
         self.evaluation_splats: SplatTensors | None = None
         self.updates = True
-        self._step_factor = 1.0
         self._rate_factors: dict[str, float] = {}
         self._late_losses: list[tuple[str, AsyncScalar]] = []
         self._view_of_step = 0
@@ -173,7 +172,7 @@ class SplatModule(LightningModule):
     @property
     def quantizers(self) -> Mapping[str, Quantizer]:
         """Quantizer by attribute; empty for a run without quantization."""
-        return cast("Mapping[str, Quantizer]", dict(self.codebooks.items()))
+        return dict(self.codebooks.items())  # type: ignore[arg-type]
 
     @property
     def scene(self) -> SplatScene:
@@ -430,11 +429,9 @@ class SplatModule(LightningModule):
         checkpoint["history"] = self.history
         checkpoint["schedule"] = asdict(self.schedule)
         checkpoint[resume.QUANTIZER_SETTINGS] = self.quantizer_settings
-        scene = run_scene.scene_of(self._trainer)
-        if scene is not None:
+        if (scene := run_scene.scene_of(self._trainer)) is not None:
             checkpoint[resume.SCENE] = resume.scene_record(scene)
-        stored = checkpoint.get(self.CHECKPOINT_HYPER_PARAMS_KEY)
-        if stored is not None:
+        if (stored := checkpoint.get(self.CHECKPOINT_HYPER_PARAMS_KEY)) is not None:
             # Without the photos nobody knows what "auto" was.
             checkpoint[self.CHECKPOINT_HYPER_PARAMS_KEY] = resume.plain(stored) | {"background": self.background}
 

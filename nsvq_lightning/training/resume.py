@@ -27,12 +27,15 @@ from nsvq_lightning.training.schedule import Schedule
 
 log = logging.getLogger(__name__)
 
+# Of a checkpoint, or of a part of one, by their names.
+Values = Mapping[str, Any]
+
 # Key under which a checkpoint holds the class and number of codes that each quantizer was made with.
 QUANTIZER_SETTINGS = "quantizer_settings"
 WAY_OUT = "pass a checkpoint that nsvq fit has written, …/checkpoints/last.ckpt"
 
 
-def continued_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> Schedule:
+def continued_schedule(checkpoint: Values, schedule: Schedule) -> Schedule:
     """The schedule with the iterations that the checkpoint's run has saved in the same warm-up phase.
 
     Raises:
@@ -48,7 +51,7 @@ def continued_schedule(checkpoint: Mapping[str, Any], schedule: Schedule) -> Sch
     return replace(schedule, saved=stored.saved) if same else schedule
 
 
-def changes(checkpoint: Mapping[str, Any], schedule: Schedule, own: Mapping[str, Any]) -> str:
+def changes(checkpoint: Values, schedule: Schedule, own: Values) -> str:
     """Options by which a run with another schedule and other settings of the module goes on as that of a checkpoint."""
     trained = checkpoint.get("hyper_parameters", {})
     kinds = ("callbacks.phases", checkpoint["schedule"], asdict(schedule)), ("model", trained, plain(own))
@@ -61,9 +64,7 @@ def changes(checkpoint: Mapping[str, Any], schedule: Schedule, own: Mapping[str,
     return shlex.join(changed).replace("callbacks.phases.total", "trainer.max_steps")
 
 
-def check_continuation(
-    checkpoint: Mapping[str, Any], own: Mapping[str, Tensor], quantizers: Mapping[str, Mapping[str, Any]]
-) -> None:
+def check_continuation(checkpoint: Values, own: Mapping[str, Tensor], quantizers: Mapping[str, Values]) -> None:
     """Check that a module can have the splats and codebooks of a checkpoint.
 
     Args:
@@ -85,7 +86,7 @@ def check_continuation(
         )
 
 
-def _described(settings: Mapping[str, Mapping[str, Any]]) -> str:
+def _described(settings: Mapping[str, Values]) -> str:
     """The quantizers of a run, for a message."""
     kinds = ", ".join(sorted({str(one["quantizer"]) for one in settings.values()}))
     sizes = ", ".join(f"{name}: {one['codes']}" for name, one in settings.items())
@@ -148,7 +149,7 @@ def _check_contents(path: StrPath, checkpoint: Any) -> None:
         raise FormatError(f"{path}: a checkpoint of another version, without {', '.join(sorted(missing))}", WAY_OUT)
 
 
-def check_settings(path: Any, settings: Mapping[str, Any], named: Collection[str] = ()) -> None:
+def check_settings(path: Any, settings: Values, named: Collection[str] = ()) -> None:
     """Check that making a module from the settings of a checkpoint imports nothing.
 
     The parser would import whatever they name. What is named by the user, on the command line or in Python, has been
@@ -210,7 +211,7 @@ def scene_record(scene: Scene) -> Json:
     return {"folder": scene.root.resolve().name, "views": digests, "read": read}
 
 
-def check_scene(checkpoint: Mapping[str, Any], scene: Scene) -> None:
+def check_scene(checkpoint: Values, scene: Scene) -> None:
     """Check that a checkpoint is of a scene: most views that both have are seen from the same place.
 
     Raises:
@@ -266,7 +267,7 @@ class PlainCheckpointIO(TorchCheckpointIO):
         return content  # of processes started from a notebook, the first hands back the weights alone
 
 
-def plain(values: Mapping[str, Any]) -> dict[str, Any]:
+def plain(values: Values) -> dict[str, Any]:
     """The entries that are plain data; dataclasses become dictionaries, everything else is left out.
 
     An object in a checkpoint would make it unreadable without executing code. LightningCLI records classes as

@@ -149,8 +149,7 @@ def _rebind(splats: Splats, optimizer: Optimizer, values: Iterable[Tensor], edit
         old = group["params"][0]
         new = nn.Parameter(rows, requires_grad=old.requires_grad)
         moments = _moments(optimizer, name)
-        state = optimizer.state.pop(old, None)
-        if state is not None:
+        if (state := optimizer.state.pop(old, None)) is not None:
             optimizer.state[new] = state | {key: edit(moment) for key, moment in moments.items()}
         group["params"][0] = new
         setattr(splats, name, new)

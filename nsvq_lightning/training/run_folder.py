@@ -59,7 +59,7 @@ def reserve(trainer: Trainer, checkpoint: StrPath | None) -> None:
         FileExistsError: The folder holds another run.
     """
     folder = _given(trainer)
-    if folder is not None and trainer.is_global_zero and not is_fast_dev_run(trainer):
+    if folder and trainer.is_global_zero and not is_fast_dev_run(trainer):
         take(folder, checkpoint)
         _RESERVED[trainer] = folder
 
@@ -123,7 +123,7 @@ def hold(folder: Path) -> None:
 
 def let_go(folder: Path) -> None:
     """Let other processes write to a folder that this one holds; does nothing otherwise."""
-    if (lock := _HELD.pop(folder.resolve(), None)) is not None:
+    if lock := _HELD.pop(folder.resolve(), None):
         for name in (MARKER, LOCK):
             with suppress(OSError):  # Windows removes no open file; an unlocked one does no harm
                 (folder / name).unlink()

@@ -82,8 +82,8 @@ def check_kernels(device: torch.device) -> None:
     """
     name = f"{torch.cuda.get_device_name(device)}, nsvq_lightning {__version__}, torch {torch.__version__}"
     folder = kernel_folder()
-    record = folder / "checked-devices.txt" if folder is not None else None
-    known = record.read_text(encoding="utf-8") if record is not None and record.exists() else ""
+    record = folder / "checked-devices.txt" if folder else None
+    known = record.read_text(encoding="utf-8") if record and record.exists() else ""
     if name in known.splitlines():  # not in a part of one: 2.1 is in 2.13
         return
     for backend, errors in kernel_errors(str(device)).items():
@@ -94,7 +94,7 @@ def check_kernels(device: torch.device) -> None:
                 "--trainer.accelerator=cpu"
             )
         log.info(said)
-    if record is not None:
+    if record:
         write_text(record, f"{known}{name}\n")
 
 
