@@ -10,7 +10,7 @@ from types import FrameType
 from typing import Any
 
 import torch
-from lightning.pytorch import Callback, Trainer
+from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
 from nsvq_lightning.io.atomic import atomic_path, make_folder_of
@@ -41,7 +41,6 @@ class GracefulStop:
     def __init__(self) -> None:
         self._handlers: dict[int, Any] = {}
         self._pending: list[int] = []
-        self._several = False
 
     def hold(self, trainer: Trainer) -> None:
         """Start to hold signals back."""
@@ -148,13 +147,12 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Come after all other checkpoint callbacks, whose best one Lightning then finds."""
         super().setup(trainer, module, stage)
-        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
         # A new list: Lightning is going through the old one.
-        trainer.callbacks = [*(each for each in callbacks if each is not self), self]  # type: ignore[attr-defined]
+        trainer.callbacks = [*(each for each in trainer.callbacks if each is not self), self]  # type: ignore[attr-defined]
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Start to hold back signals."""
-        if trainer.ckpt_path is not None:
+        if trainer.ckpt_path:
             self.best_model_path, self._saved = str(trainer.ckpt_path), trainer.global_step
         self._training = True
         self._stop.hold(trainer)
@@ -187,7 +185,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
         if not self._training or is_fast_dev_run(trainer):
             return
         self._training = False
-        if self.last_path is not None:
+        if self.last_path:
             log.warning("stopped; the last checkpoint is of iteration %d: %s", self._saved, self.last_path)
         else:
             log.warning("stopped before the first checkpoint")

@@ -279,12 +279,10 @@ class DensityControl(Densification):
         large = splats.scales.amax(1).exp() > self.dense_fraction * module.extent
         grown = statistic >= self.grad_threshold
         if (limit := self.limit(module)) is not None:
-            ranks = torch.where(grown, statistic, -torch.inf)
-            grown &= top_rows(ranks, max(0, limit - len(splats)))
+            grown &= top_rows(torch.where(grown, statistic, -torch.inf), max(0, limit - len(splats)))
         clones, parents = (detached(splats).take(grown & mask) for mask in (~large, large))
         children = split(parents, self.shrink, generator(module.seed, iteration, "split"))
-        new = RawSplats(*map(torch.cat, zip(clones, children, strict=True)))
-        return self.divide(module, grown & large, new)
+        return self.divide(module, grown & large, RawSplats(*map(torch.cat, zip(clones, children, strict=True))))
 
     def _prune(self, module: SplatModule, *, huge: bool) -> int:
         """Prune transparent splats, and huge ones if asked for; returns how many."""

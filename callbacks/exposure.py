@@ -39,9 +39,7 @@ class ExposureCompensation(SplatCallback):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._changes = torch.zeros(0, 3, 4)
         self._adam: torch.optim.Adam | None = None
-        self._row: dict[int, int] = {}
         self._loaded: dict[str, Any] | None = None
         self._plain: LossTerm | None = None
 
@@ -55,7 +53,7 @@ class ExposureCompensation(SplatCallback):
         scene = run_scene.needed_scene(trainer, need, "leave out ExposureCompensation")
         self._row = {view: row for row, view in enumerate(scene.train)}
         start = torch.zeros(len(scene.train), 3, 4)
-        if self._loaded is not None:
+        if self._loaded:
             start = self._loaded["changes"].clone()
             if len(start) != len(scene.train):
                 raise ValueError(
@@ -64,7 +62,7 @@ class ExposureCompensation(SplatCallback):
                 )
         self._changes = start.to(module.device).requires_grad_()
         self._adam = torch.optim.Adam([self._changes], lr=self.rate)
-        if self._loaded is not None:
+        if self._loaded:
             self._adam.load_state_dict(self._loaded["adam"])
             self._loaded = None
         self._plain = plain = module.loss_terms["photometric"]
@@ -97,15 +95,13 @@ class ExposureCompensation(SplatCallback):
 
     def on_exception(self, trainer: Trainer, module: SplatModule, *_: Any) -> None:
         """Leave the module as it was."""
-        if self._plain is not None:
+        if self._plain:
             module.loss_terms["photometric"] = self._plain
             self._plain = None
 
     def state_dict(self) -> dict[str, Any]:
         """Exposures and the state of their Adam."""
-        if self._adam is None:
-            return {}
-        return {"changes": self._changes.detach(), "adam": self._adam.state_dict()}
+        return {"changes": self._changes.detach(), "adam": self._adam.state_dict()} if self._adam else {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from there."""

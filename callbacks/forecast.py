@@ -103,7 +103,6 @@ def iterations_within(minutes: float, trainer: Trainer, module: SplatModule, sch
     elif module.stretches is None:
         parts = [(1.0, budget)]
     else:
-        first = max(len(scene.points), module.first_points or 0)
-        parts = module.stretches(schedule, first, budget)
+        parts = module.stretches(schedule, max(len(scene.points), module.first_points or 0), budget)
     seconds = trainer.accumulate_grad_batches * iteration_seconds(scene, parts, trainer.strategy.root_device)
     return int(trainer.strategy.broadcast(max(1, round(60 * minutes / seconds))))

@@ -57,15 +57,13 @@ class ExportScene(WritingCallback):
         # The files of viewers hold what the compressed one decodes to: found once, however many there are.
         decoded = as_stored(scene, module.storage) if set(self.formats) - {"nsvq"} else scene
         for suffix in self.formats:
-            path = folder / f"scene.{suffix}"
-            with optional(path):
+            with optional(folder / f"scene.{suffix}") as path:
                 size = save(scene, path, module.storage) if suffix == "nsvq" else save(decoded, path)
                 log.info("wrote %s (%d bytes)", path, size)
         photos = scene_of(trainer)
         if "nsvq" in self.formats and photos is not None:
-            page = folder / "viewer.html"
             cameras = dict(zip(photos.names, photos.cameras, strict=True))
-            with optional(page):
+            with optional(folder / "viewer.html") as page:
                 viewer.write_cameras(folder / CAMERAS, cameras)
                 size = viewer.write_viewer(page, folder / "scene.nsvq", cameras, photos.root.resolve().name)
                 log.info("wrote %s (%d bytes)", page, size)
@@ -119,7 +117,7 @@ class LiveScene(WritingCallback):
     none of that counts as training time. The file goes when the run ends.
     """
 
-    _running, _answered, _next = False, 0, 0.0
+    _running = False
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Forget who asked an earlier part of the run."""

@@ -37,9 +37,7 @@ class SplatProgressBar(TQDMProgressBar):
     def __init__(self, refresh_rate: int = 25) -> None:
         super().__init__(refresh_rate=refresh_rate)
         self._asked_rate = refresh_rate
-        self._psnr: float | None = None
         self._is_plain = False
-        self._start = 0.0  # of the clock that stops while kernels are compiled
 
     @property
     def total_train_batches(self) -> int | float:
@@ -54,7 +52,7 @@ class SplatProgressBar(TQDMProgressBar):
     def setup(self, trainer: Trainer, module: SplatModule, stage: str) -> None:
         """Find out whether the output shows bars; write only a few lines to a file."""
         super().setup(trainer, module, stage)
-        self._psnr = None
+        self._psnr: float | None = None
         # A terminal or a notebook can draw a line again.
         self._is_plain = not (sys.stdout.isatty() or "ipykernel" in sys.modules)
         self._refresh_rate = self._asked_rate
@@ -67,7 +65,7 @@ class SplatProgressBar(TQDMProgressBar):
         bar = self.train_progress_bar
         bar.reset(total=self.total_train_batches)
         bar.initial = bar.n = trainer.global_step  # (n - initial) / time is the speed
-        self._start = time.time() - compile_seconds()
+        self._start = time.time() - compile_seconds()  # of the clock that stops while kernels are compiled
 
     def on_train_epoch_start(self, trainer: Trainer, *args: Any) -> None:
         """Leave the bar unchanged: there is only one epoch, and a resumed run is in the middle of it."""

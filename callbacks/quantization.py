@@ -4,11 +4,11 @@ import logging
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import torch
 from lightning.pytorch import Trainer
-from torch import Tensor, nn
+from torch import Tensor
 from torch.optim import Optimizer
 
 from nsvq_lightning.quality.loss import apply_mask
@@ -108,7 +108,7 @@ class CodebookInit(SplatCallback):
                 draws = generator(module.seed, iteration, "kmeans", name)
                 quantizer.fit(module.scene.rows(name), weight, generator=draws)
             if trainer.world_size > 1:  # a fit may leave fewer codes, so counters and all other buffers must follow
-                distributed.follow_first(trainer.strategy, cast(nn.Module, quantizer))
+                distributed.follow_first(trainer.strategy, quantizer)  # type: ignore[arg-type]
         if sizes := ", ".join(f"{name} {len(q.codebook)}" for name, q in module.quantizers.items()):
             log.info("iteration %d: codebooks for %d splats: %s", iteration, len(module.splats), sizes)
 
@@ -335,7 +335,7 @@ class RateDistortion(SplatCallback):
             codes = attributes.codes_of(module.splats.raw(), name, quantizer).clone()
             rates = code_rates(codes, len(quantizer.codebook))
             codes[part] = cheapest(rows[part], quantizer.codebook, rates, price[part].to(rows))
-            cast(Any, quantizer).hold(codes)
+            quantizer.hold(codes)  # type: ignore[attr-defined]
 
 
 @dataclass(eq=False)

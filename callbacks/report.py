@@ -6,7 +6,7 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from lightning.pytorch import Callback, Trainer
+from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from torch import Tensor
 from torchmetrics import Metric
@@ -17,10 +17,8 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import Json
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.io.nsvq.file import paper_header, read_nsvq
-from nsvq_lightning.io.nsvq.header import Header
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
-from nsvq_lightning.rendering.sampling import Sampling
 from nsvq_lightning.report import numbers, page, pictures
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
@@ -39,8 +37,7 @@ def notify_monitors(trainer: Trainer, module: SplatModule) -> None:
     They wait for the end of an epoch or a validation, depending on their settings and the trainer's, and act in one of
     these hooks. Here the sampler is endless and no validation runs, so neither ever comes.
     """
-    watchers: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # Lightning does not type it
-    for watcher in watchers:
+    for watcher in trainer.callbacks:  # type: ignore[attr-defined]  # Lightning does not type it
         monitor = watcher.monitor if isinstance(watcher, EarlyStopping | ModelCheckpoint) else None
         if monitor and (monitor in trainer.callback_metrics or not monitor.startswith("train/")):
             watcher.on_train_epoch_end(trainer, module)
@@ -86,9 +83,7 @@ class MetricReport(WritingCallback):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._scene: CompressedScene | None = None
-        self._paper: Header
         self._scores: list[Json] = []
-        self._sampling: Sampling | None = None
         self._lpips: Metric | None = None
         self._lpips_reason: str | None = None
         self._beside = TimesBeside()
@@ -199,8 +194,7 @@ class MetricReport(WritingCallback):
         score["cc_ssim"] = float(ssim(corrected, photo, batch.mask))
         self._scores.append(score)
         if self.pictures:
-            path = picture_file(trainer, run_folder(trainer) / "renders", batch.name)
-            with optional(path):
+            with optional(picture_file(trainer, run_folder(trainer) / "renders", batch.name)) as path:
                 pictures.write_png(path, pictures.comparison(image, photo))
 
     def on_test_end(self, trainer: Trainer, module: SplatModule) -> None:
