@@ -166,7 +166,7 @@ def _found_views(path: Path, root: Path | None, origin: "Place") -> "Views":
         folder = Path(given).expanduser()
         if not folder.is_dir():
             folder = None
-    if folder is not None and (has_poses(folder) or not (folder / CAMERAS).is_file()):
+    if folder and (has_poses(folder) or not (folder / CAMERAS).is_file()):
         how = {name: data[name] for name in READ if name in data} | {"origin": origin}
         try:
             scene = load_scene(folder, **how)
@@ -259,7 +259,7 @@ def scene_with_views(
         known, photos = known_views(path, root, scene)
         cameras = list(known.values())
     except (ValueError, OSError) as error:
-        if root is not None:
+        if root:
             raise
         log.warning("%s: the cameras of its training cannot be read (%s)", path, error)
     if cameras and not len(scene.cameras):

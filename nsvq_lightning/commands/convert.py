@@ -124,7 +124,7 @@ def _contradiction(options: Namespace) -> str:
 def _edited(scene: CompressedScene, options: Namespace) -> CompressedScene:
     """The scene within the box, without floaters, thinned, turned and moved, up to a degree, in this order."""
     before = len(scene)
-    if options.crop is not None:
+    if options.crop:
         scene = placing.cropped(scene, np.array(options.crop[:3]), np.array(options.crop[3:]))
         if len(scene) == 0:
             named = ", ".join(map(str, options.inputs))
@@ -135,11 +135,11 @@ def _edited(scene: CompressedScene, options: Namespace) -> CompressedScene:
     left = splats_left(options.splats, len(scene))
     if left < len(scene):
         scene = _thinned(scene, left, options)
-    if options.up is not None:
+    if options.up:
         scene = placing.rotated(scene, placing.turn_up(_up(options), options.up))
-    if options.matrix is not None:
+    if options.matrix:
         scene = placing.moved(scene, np.reshape(options.matrix, (3, 4)))
-    if options.align is not None:
+    if options.align:
         from nsvq_lightning.data.colmap import alignment
         from nsvq_lightning.data.transforms import read_poses
 

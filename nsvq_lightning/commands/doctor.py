@@ -51,7 +51,7 @@ def run(options: Namespace) -> int:
     return 1 if problems else 0
 
 
-def shown(findings: "Iterator[Finding]") -> Counter[str]:
+def shown(findings: "Findings") -> Counter[str]:
     """Print findings as they come, since each check takes seconds; returns how many there are of each verdict."""
     counts = Counter[str]()
     for finding in findings:
@@ -60,14 +60,14 @@ def shown(findings: "Iterator[Finding]") -> Counter[str]:
     return counts
 
 
-def check_all(folder: Path | None) -> "Iterator[Finding]":
+def check_all(folder: Path | None) -> "Findings":
     """All findings about this machine and, if given, a scene folder."""
     yield from attempt("machine", check_machine())
     yield from attempt("packages", check_packages())
     yield from attempt("threads", check_threads())
     yield from attempt("memory", check_room(Path()))
     yield from attempt("self-test", check_backends())
-    if folder is not None:
+    if folder:
         yield from check_folder(folder)
 
 
@@ -88,12 +88,16 @@ class Finding(NamedTuple):
         return f"{self.verdict:<8} {self.subject:<12} {self.text}"
 
 
+# What a check finds, as it goes on.
+Findings = Iterator[Finding]
+
+
 def judged(subject: str, text: str, advice: str, *, when: bool) -> Finding:
     """A note with the advice when something is not as it should be, otherwise good."""
     return Finding("note", subject, f"{text}: {advice}") if when else Finding("good", subject, text)
 
 
-def attempt(subject: str, check: Iterator[Finding]) -> Iterator[Finding]:
+def attempt(subject: str, check: Findings) -> Findings:
     """The findings of a check; if it raises, that is one more, and the other checks can still be made."""
     try:
         yield from check
@@ -104,7 +108,7 @@ def attempt(subject: str, check: Iterator[Finding]) -> Iterator[Finding]:
         yield Finding("problem", subject, text if ours else f"the check itself failed: {type(error).__name__}: {text}")
 
 
-def check_machine() -> Iterator[Finding]:
+def check_machine() -> Findings:
     """The machine, and the versions of Python and of the packages that results depend on."""
     import torch
 
@@ -123,7 +127,7 @@ def check_machine() -> Iterator[Finding]:
 OPENCV = "opencv-contrib-python-headless"
 
 
-def check_packages() -> Iterator[Finding]:
+def check_packages() -> Findings:
     """OpenCV, once: several packages overwrite each other's files."""
     try:
         import cv2
@@ -136,7 +140,7 @@ def check_packages() -> Iterator[Finding]:
     yield judged("opencv", text, advice, when=len(packages) > 1)
 
 
-def check_threads() -> Iterator[Finding]:
+def check_threads() -> Findings:
     """Whether the kernels use all cores."""
     import numba
     import torch
@@ -148,8 +152,7 @@ def check_threads() -> Iterator[Finding]:
     used = thread_count()
     told = {"OMP_NUM_THREADS", "NUMBA_NUM_THREADS"} & os.environ.keys()
     # On a Mac, torch spares the slow cores, which would hold up the others.
-    is_mac = (platform.system(), platform.machine()) == ("Darwin", "arm64")
-    spared = used < cores and not told and is_mac
+    spared = used < cores and not told and (platform.system(), platform.machine()) == ("Darwin", "arm64")
     text = f"{used} used of {cores} cores (torch {torch.get_num_threads()}, numba {numba.config.NUMBA_NUM_THREADS})"
     advice = f"as many as cores are fastest; unset OMP_NUM_THREADS and NUMBA_NUM_THREADS, or set them to {cores}"
     yield judged("threads", text, advice, when=used != cores and not spared)
@@ -159,7 +162,7 @@ def check_threads() -> Iterator[Finding]:
 MIN_DISK = 2 << 30
 
 
-def check_room(folder: Path) -> Iterator[Finding]:
+def check_room(folder: Path) -> Findings:
     """Memory for a run, and disk space for checkpoints, report and exports where runs are written."""
     free = available_memory()
     text = "not told by this system" if free is None else f"{free / 1e9:.1f} GB available"
@@ -172,7 +175,7 @@ def check_room(folder: Path) -> Iterator[Finding]:
     yield judged("disk", text, advice, when=disk < MIN_DISK or not writable)
 
 
-def check_backends() -> Iterator[Finding]:
+def check_backends() -> Findings:
     """Every usable back-end against plain torch in float64, which takes seconds."""
     from nsvq_lightning.compute.devices import devices_with_kernels
     from nsvq_lightning.compute.kernel_cache import kernel_folder
@@ -188,12 +191,12 @@ def check_backends() -> Iterator[Finding]:
             yield Finding("problem", "self-test", f"{text}: {advice}what nsvq doctor says")
 
 
-def check_folder(root: Path) -> Iterator[Finding]:
+def check_folder(root: Path) -> Findings:
     """All findings about a scene folder; an unusable folder is a finding, not an exception."""
     yield from attempt("model", check_model(root))
 
 
-def check_model(root: Path) -> Iterator[Finding]:
+def check_model(root: Path) -> Findings:
     """Read the model, then check it, and the scene that it makes."""
     from nsvq_lightning.data.colmap import larger_models
     from nsvq_lightning.data.transforms import read_poses
@@ -207,7 +210,7 @@ def check_model(root: Path) -> Iterator[Finding]:
     yield from attempt("scene", check_scene(root, model))
 
 
-def check_cameras(model: "ColmapModel") -> Iterator[Finding]:
+def check_cameras(model: "ColmapModel") -> Findings:
     """Number, models and sizes of the cameras, and what distortion does to the corners."""
     from nsvq_lightning.data.colmap import size_range
 
@@ -221,7 +224,7 @@ def check_cameras(model: "ColmapModel") -> Iterator[Finding]:
     yield judged("cameras", text, advice, when=model.source == "COLMAP" and many)
 
 
-def check_points(model: "ColmapModel") -> Iterator[Finding]:
+def check_points(model: "ColmapModel") -> Findings:
     """Number of points, and outliers."""
     from nsvq_lightning.data.scene import astray
 
@@ -246,7 +249,7 @@ def check_points(model: "ColmapModel") -> Iterator[Finding]:
     yield judged("points", text, advice, when=count < 1000 or far > 0.02)
 
 
-def check_overlap(model: "ColmapModel") -> Iterator[Finding]:
+def check_overlap(model: "ColmapModel") -> Findings:
     """Whether each view shares points with another, and all are connected."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
@@ -255,8 +258,7 @@ def check_overlap(model: "ColmapModel") -> Iterator[Finding]:
 
     pairs = model.observations
     if pairs is None or not len(pairs):
-        text = f"{model.source} has no observations: how far views overlap is unknown"
-        yield Finding("note", "overlap", text)
+        yield Finding("note", "overlap", f"{model.source} has no observations: how far views overlap is unknown")
         return
     names = [image.name for image in model.images]
     seen = csr_array((np.ones(len(pairs), np.int64), pairs.T), shape=(len(model.points), len(names)))
@@ -276,7 +278,7 @@ def check_overlap(model: "ColmapModel") -> Iterator[Finding]:
     yield judged("overlap", text, advice, when=len(weak) > 0)
 
 
-def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
+def check_scene(root: Path, model: "ColmapModel") -> Findings:
     """Load the folder as a run does it, then check its split, its photos and their shape, and what a run will take."""
     from nsvq_lightning.data.images import same_shape
     from nsvq_lightning.data.points import in_picture
@@ -306,7 +308,7 @@ def check_scene(root: Path, model: "ColmapModel") -> Iterator[Finding]:
     yield from attempt("run time", check_budget(scene))
 
 
-def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
+def check_photos(scene: "Scene", model: "ColmapModel") -> Findings:
     """Decode all photos, in parallel: whether that works, how much masks exclude, and which are not in the model."""
     from nsvq_lightning.data.photo_files import photos_below
     from nsvq_lightning.data.scene import ELSEWHERE, each_photo, is_elsewhere
@@ -338,7 +340,7 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Iterator[Finding]:
         yield Finding("note", "registered", f"{text}: {advice}")
 
 
-def check_budget(scene: "Scene") -> Iterator[Finding]:
+def check_budget(scene: "Scene") -> Findings:
     """Time of a run, from steps with the splats of ``fast.yaml``."""
     from nsvq_lightning.callbacks import BudgetedGrowth, PhaseSchedule, SplatBudget
     from nsvq_lightning.callbacks.forecast import iteration_seconds

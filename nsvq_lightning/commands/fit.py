@@ -235,7 +235,7 @@ class SplatCLI(LightningCLI):
         except BaseException:
             for callback in self.trainer.checkpoint_callbacks if fits else ():
                 path = callback.last_path if isinstance(callback, RunCheckpoint) else None
-                if path is not None and self.trainer.is_global_zero:
+                if path and self.trainer.is_global_zero:
                     sys.stderr.write(f"continue with: {continuation(path)}\n")
             raise
 

@@ -99,8 +99,7 @@ def in_plain_words(message: str, arguments: Iterable[str]) -> str:
             break
     meant = nearest(value[1].rpartition(".")[2], CLASSES)
     causes = r"(?:Problem with given class_path|Invalid content in sub-config file).*?(?=\n +- |\Z)"
-    problem = re.search(causes, message, re.S)
-    if problem is not None:
+    if problem := re.search(causes, message, re.S):
         return f"{name}: {' '.join(problem[0].split())}{meant}"
     types = re.search(r"Subtypes: .*", message) or re.search(r"Expected a .*", message)
     kinds = r"Literal\[(.*?)\]|(?:<class '(?:[\w.]*\.)?|Annotated\[)(\w+)"

@@ -80,8 +80,7 @@ def run(options: Namespace) -> int:
         for reason, files in (left_out | closed).items():
             remarks.append(f"left out: {reconstruct.some(files)}: {reason}")
     if len(names) < 2:
-        few = f"{source}: {len(names)} pictures are too few, a scene takes 50 to 300"
-        raise ValueError("; ".join([few, *remarks]))
+        raise ValueError("; ".join([f"{source}: {len(names)} pictures are too few, a scene takes 50 to 300", *remarks]))
     if find_model(source):
         remarks.append(f"{source} has cameras already: nsvq fit --data.root {shlex.quote(source.as_posix())} uses them")
     heads = {name: image_head(images / name) for name in names}

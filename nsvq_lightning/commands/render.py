@@ -52,10 +52,9 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def _size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"0*([1-9]\d*)x0*([1-9]\d*)", text.lower())
-    if match is None:
-        raise ArgumentTypeError(f"must be like 1280x720, got {text}")
-    return int(match[1]), int(match[2])
+    if match := re.fullmatch(r"0*([1-9]\d*)x0*([1-9]\d*)", text.lower()):
+        return int(match[1]), int(match[2])
+    raise ArgumentTypeError(f"must be like 1280x720, got {text}")
 
 
 def _color(text: str) -> tuple[float, ...]:

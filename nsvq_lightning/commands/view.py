@@ -57,17 +57,17 @@ def run(options: Namespace) -> int:
     """
     from nsvq_lightning.report.viewer import LIVE_SCENE, viewer_page, write_viewer
 
-    if options.live and (options.output is not None or not options.scene.is_dir()):
+    if options.live and (options.output or not options.scene.is_dir()):
         raise ArgumentError(None, "--live follows a running fit: give the folder of the run, and no --output")
-    if options.output is not None and options.output.suffix.lower() not in (".html", ".htm"):
+    if options.output and options.output.suffix.lower() not in (".html", ".htm"):
         raise ArgumentError(None, f"{options.output}: a page is named .html; nsvq convert writes scene files")
     path = options.scene.resolve()
     title = f"{path.parent.name} / {path.name}" if path.is_dir() else path.name
     with _nsvq_file(options) as file:
-        if options.output is not None and file.stat().st_size > _LARGEST:
+        if options.output and file.stat().st_size > _LARGEST:
             raise ValueError(f"{path}: browsers open no page so large: nsvq compress makes it smaller")
         cameras = _cameras(options, file)
-        if options.output is not None:
+        if options.output:
             make_folder_of(options.output)
             size = write_viewer(options.output, file, cameras, title)
             say(f"{options.output}: {size:,} bytes")
@@ -144,7 +144,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     page: bytes
     file: Path
-    live: Path | None = None
+    live: Path | None
     host: str
     timeout = 20.0
     followed = False
@@ -162,7 +162,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _scene(self, is_question: bool) -> None:
         from nsvq_lightning.report.viewer import ask_live, end_live
 
-        if is_question and self.live is not None:
+        if is_question and self.live:
             # What was asked of a run that has ended in between is taken back.
             ask = end_live if self.file.exists() else ask_live
             try:
@@ -170,7 +170,7 @@ class _Handler(BaseHTTPRequestHandler):
             except OSError as error:  # a folder of somebody else, or a full disk
                 self._answer(503, f"the run cannot be asked: {error}".encode())
                 return
-        file = self.live if self.live is not None and self.live.is_file() else self.file
+        file = self.live if self.live and self.live.is_file() else self.file
         try:
             if not file.is_file():
                 message = b"waiting for the run to show its splats"

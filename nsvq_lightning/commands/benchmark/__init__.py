@@ -73,9 +73,9 @@ def run(options: Namespace) -> int:
     # Arguments are refused before torch is loaded.
     if steps is not None and steps < 4:
         raise ArgumentError(None, f"--steps must be at least 4, one for each phase, got {steps}")
-    if options.emulate is not None and (min(options.emulate) < 1 or options.suites != ("train",)):
+    if options.emulate and (min(options.emulate) < 1 or options.suites != ("train",)):
         raise ArgumentError(None, "--emulate takes numbers of cores, and is for the suite train alone")
-    if options.init_from is not None and not (scene is not None and scene.is_dir()):
+    if options.init_from and not (scene and scene.is_dir()):
         raise ArgumentError(None, "--init-from needs a COLMAP folder as --scene, whose cameras see its splats")
     from nsvq_lightning.commands.benchmark.timing import Scope, as_markdown, describe_machine
 

@@ -56,7 +56,7 @@ class Scope:
     @property
     def photos(self) -> Path | None:
         """The COLMAP folder, if the scene is one."""
-        return self.scene if self.scene is not None and self.scene.is_dir() else None
+        return self.scene if self.scene and self.scene.is_dir() else None
 
     @property
     def codebooks(self) -> str:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import fmean, median
 from tempfile import TemporaryDirectory
-from typing import Any, cast
+from typing import Any
 from warnings import catch_warnings
 
 import torch
@@ -54,21 +54,19 @@ class StepClock(Callback):
         self.psnr = 0.0
         self.splats = 0
         self._product = timing.sgemm()
-        self._since = 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the first step."""
-        if self.regions is not None:
+        if self.regions:
             self.regions.taken()
         self._since = time.perf_counter()
 
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *args: Any) -> None:
+    def on_train_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, *args: Any) -> None:  # type: ignore[override]
         """End a step, the work of a GPU included, and start the next; compare the test views after the last."""
-        if self.regions is not None:
+        if self.regions:
             self.kernels.append(self.regions.taken())
         timing.finish()
         took = 1000 * (time.perf_counter() - self._since)
-        module = cast(SplatModule, pl_module)
         self.steps.append((module.phase, took))
         if trainer.global_step == trainer.max_steps:
             self.psnr = _test_psnr(module)
@@ -95,7 +93,7 @@ class StepClock(Callback):
         clock = StepClock()
         for (phase, took), kernels in zip(self.steps, self.kernels, strict=True):
             seconds = took / 1000 - sum(whole for _, whole in kernels)
-            if cores and self.regions is not None:
+            if cores and self.regions:
                 seconds += sum(makespan(parts, cores) + self.regions.wake * (cores > 1) for parts, _ in kernels)
             clock.steps.append((phase, 1000 * seconds))
         clock.products, clock.psnr, clock.splats = self.products, self.psnr, self.splats
@@ -130,13 +128,10 @@ def _train(scope: Scope, clock: StepClock) -> None:
         scope: Says which config, scene, first splats and length.
         clock: Times the steps.
     """
-    if scope.photos is not None:
+    data = ["--data=DemoDataModule", *QUICK_DEMO * scope.quick]
+    if scope.photos:
         data = ["--data=ColmapDataModule", f"--data.root={scope.photos}"]
-    else:
-        data = ["--data=DemoDataModule"]
-        if scope.quick:
-            data += QUICK_DEMO
-    if scope.init_from is not None:
+    if scope.init_from:
         data.append(f"--model.init_from={scope.init_from}")
     logging.disable(logging.WARNING)  # of Lightning, about devices, loaders and the end of the run
     try:
@@ -173,7 +168,7 @@ def run(scope: Scope) -> Iterator[Measurement]:
     for name in [*variants, *reversed(variants)][: rounds * len(variants)]:
         with switched(**variants[name]):
             _train(scope, clocks[name])
-    if regions is not None:
+    if regions:
         parts = StepClock(regions)
         regions.emulate(max(scope.emulate))
         for _ in range(rounds):

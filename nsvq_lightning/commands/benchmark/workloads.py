@@ -80,12 +80,12 @@ def workloads(scope: Scope) -> list[Workload]:
         centre, reach = middle_of(splats.means.numpy())
         return [_seen_by(_camera(800, 533, centre, 2 * (reach or 1.0)), splats, name)]
     scene = load_scene(scope.photos)
-    if scope.init_from is not None:
+    if scope.init_from:
         splats = read_scene(scope.init_from).tensors()
         name += f" {scope.init_from.name}"
     else:
         scene = scene.standard
-        splats = detached(Splats.from_points(scene.points, scene.colors, sh_degree=3))
+        splats = detached(Splats.from_points(scene.points, scene.colors))
     return [_seen_by(scene.cameras[scene.train[0]], splats, name)]
 
 
@@ -117,7 +117,7 @@ def _tensor(values: Float64s) -> Tensor:
 def _directions(rng: np.random.Generator, count: int, dim: int) -> Float64s:
     """Uniform unit vectors ``[count, dim]``."""
     vectors = rng.normal(size=(count, dim))
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)  # type: ignore[no-any-return]
 
 
 def _positions(count: int, rng: np.random.Generator) -> Float64s:
@@ -126,8 +126,7 @@ def _positions(count: int, rng: np.random.Generator) -> Float64s:
     sphere = _directions(rng, quarter, 3) * 0.9 + rng.normal(size=(quarter, 3)) * 0.02
     x = rng.uniform(-2.2, 2.2, quarter)
     y = 0.9 + rng.normal(size=quarter) * 0.02
-    z = rng.uniform(-2.2, 2.2, quarter)
-    ground = np.c_[x, y, z]
+    ground = np.c_[x, y, rng.uniform(-2.2, 2.2, quarter)]
     box = rng.uniform(-0.4, 0.4, (tenth, 3))
     axis = rng.integers(0, 3, tenth)
     box[np.arange(tenth), axis] = 0.4 * (rng.integers(0, 2, tenth) * 2 - 1)
