@@ -89,6 +89,15 @@ class CodebookInit(SplatCallback):
         """Tell how large codebooks may be."""
         module.values_per_splat = self.values_per_splat or math.inf
 
+    def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
+        """Look for the train views now, not after most of the training.
+
+        Raises:
+            ValueError: Weights need a data module with a scene.
+        """
+        if self.weighted and module.quantizers:
+            run_scene.needed_scene(trainer, *run_scene.FOR_WEIGHTS)
+
     def is_due(self, module: SplatModule, iteration: int) -> bool:
         """Whether codebooks are placed before this iteration."""
         return iteration == module.schedule.first_of(Phase.QUANTIZE)

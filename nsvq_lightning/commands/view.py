@@ -12,12 +12,13 @@ import sys
 import webbrowser
 from argparse import ArgumentError, ArgumentParser, Namespace
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
 from ipaddress import ip_address
 from pathlib import Path
 from shutil import copyfileobj
+from socket import AF_INET, SOCK_DGRAM, socket
 from tempfile import TemporaryDirectory
 from threading import Thread
 from typing import TYPE_CHECKING, Any
@@ -82,7 +83,7 @@ def run(options: Namespace) -> int:
             raise OSError(f"cannot listen on {options.host}:{options.port} ({error}); choose another --port") from None
         with server:
             address = f"http://{options.host}:{server.server_port}/"
-            say(f"{title} is at {address} until Ctrl-C")
+            say(f"{title} is at {address.replace('0.0.0.0', _own_address())} until Ctrl-C")
             if options.open:
                 # A browser in this terminal returns when it is left.
                 Thread(target=webbrowser.open, args=(address,), daemon=True).start()
@@ -196,6 +197,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing of each request."""
+
+
+def _own_address() -> str:
+    """The address that other machines of the network have for this one."""
+    with suppress(OSError), socket(AF_INET, SOCK_DGRAM) as way:
+        way.connect(("192.0.2.1", 9))  # sends nothing
+        return str(way.getsockname()[0])
+    return "0.0.0.0"
 
 
 def _is_own(header: str, bound: str) -> bool:

@@ -347,7 +347,8 @@ class Compressor:
             sizes["shN"] += setting.more
         if self.parts > 1 and (sizes or setting.splats < len(self.scene)):
             return self._train_parts(setting)
-        steps = 4 if self.stopped else max(4, self.steps or self.usual_steps(setting.splats))
+        steps = self.usual_steps(setting.splats) if self.steps is None else self.steps
+        steps = 4 if self.stopped else max(4, steps)
         prune = steps // 4 if setting.splats < len(self.scene) else 0
         module = SplatModule(
             splats=self._splats,

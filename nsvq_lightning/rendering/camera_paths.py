@@ -135,7 +135,10 @@ def read_camera_path(path: Path) -> tuple[list[Camera], float]:
         cameras = [_entry_camera(entry, *size) for entry in entries]
         if not cameras:
             raise ValueError("it has no cameras")
-        return cameras, float(content.get("fps", 24))
+        fps = float(content.get("fps", 24))
+        if not 0 < fps < math.inf:
+            raise ValueError(f"its fps is {fps:g}")
+        return cameras, fps
 
 
 @contextmanager

@@ -55,7 +55,7 @@ def image_axes(
     means: Tensor, quats: Tensor, scales: Tensor, camera: Camera
 ) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
     """View-space x, y, z ``[N]`` of splats, and their axes along x and along y of the image ``[N, 3]``, pixels."""
-    viewmat = camera.viewmat.to(means)
+    viewmat = camera.viewmat.to(means).clone()  # one that was made for an evaluation cannot be trained with
     fx, fy, _, _ = camera.intrinsics
     x, y, z = (times_vectors(viewmat[:3, :3], means) + viewmat[:3, 3]).unbind(1)
     low_x, high_x, low_y, high_y = camera.slope_limits

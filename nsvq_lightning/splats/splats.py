@@ -98,7 +98,7 @@ class Splats(nn.Module):
     def from_tensors(
         cls, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor
     ) -> "Splats":
-        """Splats from raw attributes.
+        """Splats from raw attributes, which may also be NumPy arrays.
 
         Args:
             means: World positions ``[N, 3]``.
@@ -111,9 +111,9 @@ class Splats(nn.Module):
         Raises:
             ValueError: A shape does not fit the others.
         """
-        tensors = RawSplats(means, quats, scales, opacities, sh0, shN)._asdict()
+        tensors = RawSplats(*map(torch.as_tensor, (means, quats, scales, opacities, sh0, shN)))._asdict()
         check_shapes(tensors)
-        splats = cls(sh_degree_of(shN))
+        splats = cls(sh_degree_of(tensors["shN"]))
         for name, tensor in tensors.items():
             setattr(splats, name, nn.Parameter(tensor.detach().clone()))
         return splats

@@ -54,13 +54,17 @@ def needed_scene(trainer: Trainer, need: str, otherwise: str) -> Scene:
     return scene
 
 
+# What contributions need, and what to do without.
+FOR_WEIGHTS = "contributions of splats need the train views", "take CodebookInit(weighted=False)"
+
+
 def train_contributions(trainer: Trainer, trained: SplatScene) -> Tensor:
     """Blending weight ``[N]`` of each splat in all train views (:mod:`nsvq_lightning.training.importance`).
 
     Raises:
         ValueError: The trainer has no data module with a scene.
     """
-    scene = needed_scene(trainer, "contributions of splats need the train views", "take CodebookInit(weighted=False)")
+    scene = needed_scene(trainer, *FOR_WEIGHTS)
     cameras = scene.train_cameras[trainer.global_rank :: trainer.world_size]
     return sum_over_processes(trainer, contributions(trained.splats, cameras, trained.render))
 

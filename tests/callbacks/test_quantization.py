@@ -14,6 +14,7 @@ from runs import paper_replacement
 from torch import Tensor
 
 from nsvq_lightning.callbacks import (
+    CodebookInit,
     CodebookRefit,
     CodebookReplacement,
     FreezeCodes,
@@ -83,6 +84,14 @@ def test_lambda_acts_in_the_prune_phase_only() -> None:
         values[step + 1] = [float(term(None, None)) for term in module.loss_terms.values()]
     expected = pytest.approx([1e-7 * float(opacities.sigmoid().sum())])
     assert values == {1: [], 15_000: [], 15_001: expected, 20_000: expected, 20_001: []}
+
+
+def test_photos_that_weights_need_are_missed_at_the_start() -> None:
+    trainer: Any = SimpleNamespace(datamodule=None)
+    module: Any = SimpleNamespace(quantizers={"scales": NSVQ(4, 3)})
+    with pytest.raises(ValueError, match=r"need the train views: .*CodebookInit\(weighted=False\)"):
+        CodebookInit().before_fit(trainer, module)
+    CodebookInit(weighted=False).before_fit(trainer, module)
 
 
 def test_the_sh_degree_grows_up_to_that_of_the_splats() -> None:

@@ -206,6 +206,8 @@ def test_minutes_limit_the_steps() -> None:
     cameras = cameras_around(scene.means, 3, 80, 60)
     brief, long = (Compressor(scene, cameras, minutes=minutes) for minutes in (1e-9, 1e9))
     assert [brief.usual_steps(300), long.usual_steps(300), long.usual_steps(200)] == [20, 500, 1500]
+    none, few = (nl.compress(scene, cameras, codebooks="0.5k", steps=steps) for steps in (0, 4))
+    assert none.codes["shN"].tobytes() == few.codes["shN"].tobytes()
 
 
 def test_a_scene_of_another_program_is_compressed() -> None:

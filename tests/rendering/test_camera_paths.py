@@ -157,6 +157,9 @@ def test_nerfstudio_paths_are_read(tmp_path: Path, form: str) -> None:
         assert (found.width, found.height) == (80, 60)
 
 
+ENTRY = json.dumps({"matrix": np.eye(4).ravel().tolist(), "fov": 50})
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -167,6 +170,7 @@ def test_nerfstudio_paths_are_read(tmp_path: Path, form: str) -> None:
         ('{"keyframes": [{}], "render_width": 4, "render_height": 3}', "lacks 'matrix'"),
         ('{"keyframes": [{}]}', "lacks 'render_width'"),
         ('{"camera_type": "equirectangular", "keyframes": []}', "camera_type is equirectangular, and only perspective"),
+        (f'{{"keyframes": [{ENTRY}], "render_width": 4, "render_height": 3, "fps": 0}}', "its fps is 0"),
         ('{"keyframes": [{"matrix": [1], "fov": 50}], "render_width": 4, "render_height": 3}', "reshape"),
     ],
 )

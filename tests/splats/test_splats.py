@@ -119,3 +119,12 @@ def test_first_splats_are_as_large_as_their_distance_says() -> None:
     assert other.opacities.sigmoid().tolist() == pytest.approx([0.3] * 8)
     with pytest.raises(ValueError, match=r"colours of points are up to 255, not in \[0, 1\]: divide bytes by 255"):
         Splats.from_points(points, torch.full_like(points, 255, dtype=torch.uint8))
+
+
+def test_splats_of_arrays_are_those_of_tensors() -> None:
+    raw = random_splats(5)
+    made = Splats.from_tensors(*(tensor.numpy() for tensor in raw))
+    for one, other in zip(made.raw(), raw, strict=True):
+        assert torch.equal(one, other)
+    made.means.data[0] = 7
+    assert not (raw.means == 7).any()
