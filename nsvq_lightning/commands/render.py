@@ -119,9 +119,10 @@ def _path(
     if kind not in ("through", "orbit") and (options.frames or options.seconds):
         raise ValueError(f"--frames and --seconds are for the paths through and orbit; {kind} has frames of its own")
     if kind not in ("through", "cameras", "orbit"):
-        near = min(camera.near for camera in cameras or likely_cameras(splats, 1))  # which the path does not say
+        known = cameras or likely_cameras(splats, 1)  # of what the path does not say
+        near, limits = min(camera.near for camera in known), known[0].slope_limits
         path, own = read_camera_path(Path(kind))
-        cameras = [replace(camera, near=near) for camera in path]
+        cameras = [replace(camera, near=near, slope_limits=limits) for camera in path]
         fps = options.fps or own
     elif not cameras:
         if kind != "orbit":

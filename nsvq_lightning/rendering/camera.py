@@ -1,6 +1,7 @@
 """A pinhole camera."""
 
 import math
+from collections.abc import Iterable
 from copy import copy
 from dataclasses import dataclass, field
 from numbers import Integral
@@ -26,6 +27,9 @@ class Camera:
         width: Image width in pixels.
         height: Image height in pixels.
         near: Splats whose centre is nearer than this along the viewing axis are not seen, scene units.
+        slope_limits: Lowest and highest x/z, then y/z, at which a Jacobian is evaluated: by default a margin beyond the
+            image. A picture of another shape or focal length than those of training needs theirs: beyond, splats were
+            never stretched so far, and would lie as streaks over what is in view.
         intrinsics: ``(fx, fy, cx, cy)`` in pixels.
         packed_view: Rotation row by row, translation and camera position: 15 numbers in float64, the same on every
             machine.
@@ -40,6 +44,7 @@ class Camera:
     width: int
     height: int
     near: float = NEAR
+    slope_limits: tuple[float, ...] = ()
     intrinsics: tuple[float, float, float, float] = field(init=False, repr=False)
     packed_view: tuple[float, ...] = field(init=False, repr=False)
 
@@ -68,21 +73,17 @@ class Camera:
         if not ((turn @ turn.T - torch.eye(4)).abs().max() < 0.01 and turn.det() > 0):
             shape = "a rotation and a translation, over 0 0 0 1: is it transposed, mirrored or scaled?"
             raise ValueError(f"Camera.viewmat must be world to camera, {shape}")
+        if not self.slope_limits:
+            margin_x, margin_y = 0.5 * FRUSTUM_MARGIN * self.width / fx, 0.5 * FRUSTUM_MARGIN * self.height / fy
+            vars(self)["slope_limits"] = (
+                -cx / fx - margin_x, (self.width - cx) / fx + margin_x,
+                -cy / fy - margin_y, (self.height - cy) / fy + margin_y,
+            )  # fmt: skip
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.width, self.height
-
-    @property
-    def slope_limits(self) -> tuple[float, float, float, float]:
-        """Lowest and highest x/z, then y/z, at which a Jacobian is evaluated: a margin beyond the image."""
-        fx, fy, cx, cy = self.intrinsics
-        margin_x, margin_y = 0.5 * FRUSTUM_MARGIN * self.width / fx, 0.5 * FRUSTUM_MARGIN * self.height / fy
-        return (
-            -cx / fx - margin_x, (self.width - cx) / fx + margin_x,
-            -cy / fy - margin_y, (self.height - cy) / fy + margin_y,
-        )  # fmt: skip
 
     @property
     def position(self) -> Tensor:
@@ -104,7 +105,9 @@ class Camera:
         return moved
 
 
-def camera_of(viewmat: Tensor, lens: tuple[float, ...], width: int, height: int, near: float = NEAR) -> Camera:
+def camera_of(
+    viewmat: Tensor, lens: Iterable[float], width: int, height: int, near: float = NEAR, limits: Iterable[float] = ()
+) -> Camera:
     """A camera.
 
     Args:
@@ -113,6 +116,8 @@ def camera_of(viewmat: Tensor, lens: tuple[float, ...], width: int, height: int,
         width: Pixels.
         height: Pixels.
         near: Distance of the near plane, scene units.
+        limits: Its slope limits; a margin beyond the image by default.
     """
-    fx, fy, cx, cy = (float(number) for number in lens)
-    return Camera(torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), viewmat, width, height, near)
+    fx, fy, cx, cy = map(float, lens)
+    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return Camera(K, viewmat, width, height, near, tuple(map(float, limits)))

@@ -24,11 +24,12 @@ CAMERAS = "cameras.json"
 
 
 def reframed(camera: Camera, width: int, height: int) -> Camera:
-    """The camera with another picture size: all that it sees stays in view, centred."""
+    """The camera with another picture size: all that it sees stays in view, centred, and looks as before."""
     fx, fy, cx, cy = camera.intrinsics
     factor = min(width / camera.width, height / camera.height)
     centre = width / 2 + factor * (cx - camera.width / 2), height / 2 + factor * (cy - camera.height / 2)
-    return camera_of(camera.viewmat, (factor * fx, factor * fy, *centre), width, height, camera.near)
+    lens = factor * fx, factor * fy, *centre
+    return camera_of(camera.viewmat, lens, width, height, camera.near, camera.slope_limits)
 
 
 def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -53,7 +54,7 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     steps = _steps(positions, rotations, unit)
     kept = np.r_[True, steps > 1e-6]
     positions, rotations = positions[kept], rotations[kept]
-    intrinsics = np.array([camera.intrinsics for camera in cameras])[kept]
+    lenses = np.array([camera.intrinsics + camera.slope_limits for camera in cameras])[kept]
     if len(positions) == 1:
         return [cameras[0]] * frames
     at = np.r_[0.0, np.cumsum(steps[kept[1:]])]
@@ -62,9 +63,9 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     fine = np.linspace(0.0, at[-1], 16 * frames + 1)  # where the speed is measured
     way = np.r_[0.0, np.cumsum(_steps(place(fine), turn(fine), unit))]
     times = np.interp(np.linspace(0.0, way[-1], frames), way, fine)
-    lenses = np.stack([np.interp(times, at, column) for column in intrinsics.T], axis=1)
+    lenses = np.stack([np.interp(times, at, column) for column in lenses.T], axis=1)
     return [
-        camera_of(view_from(matrix, position), tuple(lens), *cameras[0].size, cameras[0].near)
+        camera_of(view_from(matrix, position), lens[:4], *cameras[0].size, cameras[0].near, lens[4:])
         for matrix, position, lens in zip(turn(times).as_matrix(), place(times), lenses, strict=True)
     ]
 
@@ -103,12 +104,12 @@ def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     turns = 2 * math.pi * (np.arange(frames) / frames)
     if arc < math.radians(270):
         turns = arc * (0.5 + 0.5 * np.sin(turns))
-    lens = tuple(np.median([camera.intrinsics for camera in cameras], axis=0))
+    lens = np.median([camera.intrinsics + camera.slope_limits for camera in cameras], axis=0)
     first = cameras[0]
     path = []
     for angle in start + turns:
         eye = middle + height * up + radius * (math.cos(angle) * across + math.sin(angle) * ahead)
-        path.append(camera_of(view_towards(middle, eye, up), lens, *first.size, first.near))
+        path.append(camera_of(view_towards(middle, eye, up), lens[:4], *first.size, first.near, lens[4:]))
     return path
 
 

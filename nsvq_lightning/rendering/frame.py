@@ -72,9 +72,9 @@ class Frame:
             return camera
         packed = np.array(camera.packed_view)
         view = viewmat_of(packed[:9].reshape(3, 3), self.points(packed[None, 12:])[0])
-        return Camera(
-            camera.K.double(), torch.from_numpy(view), *camera.size, float(f"{camera.near / self.unit:.6g}")
-        ).to(dtype=torch.float32)
+        near = float(f"{camera.near / self.unit:.6g}")
+        here = Camera(camera.K.double(), torch.from_numpy(view), *camera.size, near, camera.slope_limits)
+        return here.to(dtype=torch.float32)
 
     def sampling(self, sampling: Sampling | None) -> Sampling | None:
         """The sampling of splats of the files, here."""

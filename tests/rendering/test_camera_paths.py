@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from splat_scenes import front_camera, random_splats
 
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.camera_paths import orbit, read_camera_path, read_cameras, reframed, smooth_path
 from nsvq_lightning.rendering.frame import Frame
+from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.splats.splats import Splats
 
 
 def camera(position: Any, rotation: Rotation | None = None, focal: float = 100.0) -> Camera:
@@ -277,3 +280,16 @@ def test_what_is_no_list_of_cameras_is_refused(tmp_path: Path, text: str) -> Non
     (tmp_path / "cameras.json").write_bytes(text.encode("utf-8", "surrogatepass"))
     with pytest.raises(ValueError, match=r"cameras\.json is no list of cameras"):
         read_cameras(tmp_path / "cameras.json")
+
+
+def test_a_wide_picture_shows_what_a_photo_of_portrait_shape_shows() -> None:
+    """Splats beside the photo are no streaks across it."""
+    splats, photo = Splats.from_tensors(*random_splats(300, log_scale=-1.0)), front_camera(40, 80)
+    wide = reframed(photo, 160, 80)
+    middle, expected = render(splats, wide).image[:, 60:100], render(splats, photo).image
+    torch.testing.assert_close(middle, expected, atol=1e-4, rtol=0)
+    own = render(splats, replace(wide, slope_limits=())).image[:, 60:100]
+    assert (own - expected).abs().max() > 0.02
+    moved = replace(wide, viewmat=torch.eye(4))
+    for each in (*orbit([wide, moved], 3), *smooth_path([wide, moved], 3), Frame(2.0).camera(wide)):
+        assert each.slope_limits == pytest.approx(photo.slope_limits)

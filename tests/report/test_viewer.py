@@ -23,6 +23,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.io.formats import read_scene, save
 from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.camera_paths import reframed
 from nsvq_lightning.rendering.poses import up_of
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.rendering.sampling import focal_of
@@ -250,6 +251,18 @@ def test_browser_draws_what_the_package_renders(tab: Page, page: Path, scene_fil
     )
     urls = [event["params"]["request"]["url"] for event in tab.events if event["method"] == "Network.requestWillBeSent"]
     assert {url.split(":")[0] for url in urls} <= {"file", "blob"}
+
+
+@needs_chromium
+def test_a_wide_window_shows_a_photo_of_portrait_shape_as_it_was_trained(
+    tab: Page, tmp_path: Path, scene_file: Path
+) -> None:
+    camera = front_camera(64, 96)
+    write_viewer(tmp_path / "viewer.html", scene_file, {"front": camera}, "t")
+    wide = reframed(camera, 240, 96)
+    _shown(tab, (tmp_path / "viewer.html").as_uri(), wide.width, wide.height)
+    assert _psnr(tab, scene_file, wide) > 55
+    assert _psnr(tab, scene_file, replace(wide, slope_limits=())) < 45
 
 
 @needs_chromium

@@ -212,6 +212,7 @@ uniform mat3 rotation;     // world to camera
 uniform vec3 translation;
 uniform vec2 size;         // of the picture, pixels
 uniform vec4 lens;         // fx, fy, cx, cy, pixels
+uniform vec4 slopes;       // lowest x/z and y/z of a photo and its margin, then the highest
 uniform float near;        // nothing is seen before it
 uniform float enlarged;    // (focal length here / in training)^2
 flat out vec4 colour;      // opacity last
@@ -233,8 +234,7 @@ void main() {
     2.0 * (q.y * q.z - q.x * q.w), 1.0 - 2.0 * (q.y * q.y + q.w * q.w), 2.0 * (q.z * q.w + q.x * q.y),
     2.0 * (q.y * q.w + q.x * q.z), 2.0 * (q.z * q.w - q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z));
   axes = transpose(mat3(axes[0] * deviations.x, axes[1] * deviations.y, axes[2] * deviations.z));
-  vec2 margin = 0.15 * size / lens.xy;
-  vec2 slope = clamp(centre.xy / z, -lens.zw / lens.xy - margin, (size - lens.zw) / lens.xy + margin);
+  vec2 slope = clamp(centre.xy / z, slopes.xy, slopes.zw);
   vec3 u = lens.x / z * (axes[0] - slope.x * axes[2]), v = lens.y / z * (axes[1] - slope.y * axes[2]);
   float xx = dot(u, u), xy = dot(u, v), yy = dot(v, v);
   if (!(xx + yy < 1e18)) return;
@@ -394,7 +394,7 @@ class Renderer {
     }
     gl.useProgram(program);
     for (const [name, slot] of Object.entries(samplers)) gl.uniform1i(gl.getUniformLocation(program, name), slot);
-    const names = ["eye", "rotation", "translation", "size", "lens", "near", "enlarged", "scale"];
+    const names = ["eye", "rotation", "translation", "size", "lens", "slopes", "near", "enlarged", "scale"];
     const at = Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]));
     return { program, at };
   }
@@ -415,7 +415,7 @@ class Renderer {
   }
 
   /** Draw what a camera (`view` below) sees over `background`, with `share` of the canvas's resolution. */
-  draw({ position, axes, near, fx, fy, cx, cy }, background, share) {
+  draw({ position, axes, near, frame, fx, fy, cx, cy }, background, share) {
     const gl = this.gl, { width, height } = this.canvas;
     if (this.picture?.width !== width || this.picture?.height !== height) {
       if (this.picture) {
@@ -443,6 +443,9 @@ class Renderer {
     gl.uniform3fv(this.splat.at.translation, axes.map((axis) => -dot(axis, position)));
     gl.uniform2f(this.splat.at.size, ...size);
     gl.uniform4f(this.splat.at.lens, fx * sx, fy * sy, cx * sx, cy * sy);
+    const [w, h] = [frame.width, frame.height];
+    const low = [(-frame.cx - 0.15 * w) / frame.fx, (-frame.cy - 0.15 * h) / frame.fy];
+    gl.uniform4f(this.splat.at.slopes, ...low, low[0] + (1.3 * w) / frame.fx, low[1] + (1.3 * h) / frame.fy);
     gl.uniform1f(this.splat.at.near, near);
     gl.uniform1f(this.splat.at.enlarged, this.#enlarged(Math.sqrt(fx * sx * fy * sy)));
     gl.enable(gl.BLEND);
