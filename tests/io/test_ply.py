@@ -279,6 +279,17 @@ def test_the_filter_of_mip_splatting_becomes_part_of_the_splats(tmp_path: Path) 
     assert not splats.antialiased
 
 
+def test_harmonics_of_0_in_a_compressed_file_brighten_nothing(tmp_path: Path) -> None:
+    splats = scene(300)
+    for value in (0.0, 0.5, -1 / 32):
+        splats.raw["shN"][:] = value
+        save(splats, tmp_path / "a.compressed.ply")
+        error = arrays_of(read_scene(tmp_path / "a.compressed.ply")).shN - value
+        assert abs(error).max() <= 1 / 64 + 1e-6
+        assert abs(error.mean((1, 2))).max() < 1 / 64 / 40  # of every splat
+        assert abs(error.mean(0)).max() < 1e-6  # of every coefficient
+
+
 def test_harmonics_beyond_what_a_compressed_file_holds_are_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
