@@ -52,8 +52,8 @@ def image_head(path: Path) -> ImageHead:
     try:
         with Image.open(path) as image:
             size = image.size
-            # Pillow decodes a whole PNG to look for a tag that is hardly ever there.
-            tags = {} if image.format == "PNG" else image.getexif()
+            # Pillow decodes a whole PNG to look for tags behind its pixels, where hardly any has them.
+            tags = {} if image.format == "PNG" and "exif" not in image.info else image.getexif()
             orientation = int(tags.get(Base.Orientation, 1))
             if image.format == "TIFF":  # Pillow applies the orientation to their size
                 size = int(tags[Base.ImageWidth]), int(tags[Base.ImageLength])

@@ -20,6 +20,7 @@ from nsvq_lightning.data.images import (
     ImageStore,
     Picture,
     edges_of,
+    head_for,
     image_head,
     read_image,
     read_mask,
@@ -61,6 +62,15 @@ def test_exif_orientation_is_ignored_as_colmap_does(tmp_path: Path) -> None:
     picture.save(tmp_path / "turned.jpg", quality=95, exif=exif)
     assert image_head(tmp_path / "turned.jpg").size == (64, 48)
     assert read_image(tmp_path / "turned.jpg").shape == (48, 64, 3)
+
+
+def test_the_orientation_of_a_png_is_known(tmp_path: Path) -> None:
+    exif = PIL.Image.Exif()
+    exif[0x0112] = 6
+    PIL.Image.fromarray(cv2.resize(RGB, (64, 48))).save(tmp_path / "turned.png", exif=exif)
+    assert image_head(tmp_path / "turned.png")[:2] == ((64, 48), 6)
+    assert head_for(tmp_path / "turned.png", (48, 64))[:2] == ((48, 64), 6)
+    assert read_image(tmp_path / "turned.png").shape == (48, 64, 3)
 
 
 def _tiff(picture: NDArray[np.uint8], orientation: int, order: str) -> bytes:
