@@ -264,7 +264,8 @@ def scene_with_views(
         log.warning("%s: the cameras of its training cannot be read (%s)", path, error)
     if cameras and not len(scene.cameras):
         trained = photos.train_cameras if photos else cameras
-        log.info("%s: blur and size are those of %d cameras that it was trained by", path, len(trained))
+        said = f"those of {len(trained)} cameras, {trained[0].width} pixels wide, that it was trained by"
+        log.info("%s: blur and size are %s", path, said)
         scene = replace(scene, cameras=trained_by(trained))
     arguments = map(arguments_of, folders_beside(path))
     if (photos and photos.white) or any("white_background=True" in given for given in arguments):
