@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 import re
 from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Iterable
@@ -118,7 +119,7 @@ def scene_file(path: Path) -> Path:
     if path.is_dir():
         file = path / "scene.nsvq"
         if not file.is_file():
-            runs = sorted(path.glob("version_*/scene.nsvq"))
+            runs = sorted(path.glob("version_*/scene.nsvq"), key=os.path.getmtime)
             newest = f", such as {runs[-1].parent}" if runs else ""
             raise ValueError(f"{path} holds no scene.nsvq: name a scene file, or the folder of a finished run{newest}")
         return file

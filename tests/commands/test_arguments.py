@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 from dataclasses import replace
 from inspect import signature
@@ -81,6 +82,12 @@ def test_a_scene_is_a_file_or_that_of_a_run(tmp_path: Path) -> None:
     file.touch()
     assert scene_file(file) == scene_file(file.parent) == file
     with pytest.raises(ValueError, match=f"holds no scene.nsvq: .*, such as {file.parent}"):
+        scene_file(tmp_path)
+    newer = tmp_path / "version_10" / "scene.nsvq"
+    newer.parent.mkdir()
+    newer.touch()
+    os.utime(file, (1, 1))
+    with pytest.raises(ValueError, match=f", such as {newer.parent}"):
         scene_file(tmp_path)
     with pytest.raises(FileNotFoundError, match="there is no file or folder"):
         scene_file(tmp_path / "other.ply")
