@@ -231,7 +231,7 @@ def _camera_line(line: int, words: Sequence[str]) -> CameraRow:
         raise ValueError(
             f"line {line}: camera {number:g} of model {model} has {len(params)} parameters in place of {LENSES[model]}"
         )
-    return CameraRow(int(number), model, int(width), int(height), tuple(params))
+    return CameraRow(int(number), model, round(width), round(height), tuple(params))
 
 
 def _image_lines(path: Path) -> Iterator[ImageRow]:
@@ -239,7 +239,7 @@ def _image_lines(path: Path) -> Iterator[ImageRow]:
     after_image = False
     for line, text in _lines(path):
         words = text.split(maxsplit=9)
-        if after_image and re.search(r"(^|\s)-?\d+$", text) and len(text.split()) % 3 == 0:
+        if after_image and re.fullmatch(r"[-+.\deE\s]*\s-?\d+", text) and len(text.split()) % 3 == 0:
             after_image = False
             continue
         if len(words) < 10:

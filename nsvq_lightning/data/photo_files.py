@@ -141,11 +141,12 @@ def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]
         NoPhotosError: None has the photos.
         SceneError: Several have.
     """
+    divisor = 1 if name.endswith(f"_{factor}") else factor or 1
     scaled = root / f"{name}_{factor}"
     if factor and factor > 1 and scaled.is_dir():
         return scaled, 1
     if (root / name).is_dir():
-        return root / name, factor or 1
+        return root / name, divisor
     plain = [given.replace("\\", "/") for given in names]
     folders = [path for depth in ("*", "*/*") for path in sorted(root.glob(depth)) if not _NO_PHOTOS.search(path.name)]
     found = [path for path in (root, *folders) if all((path / given).is_file() for given in plain)]

@@ -233,6 +233,8 @@ def _read_transforms(files: list[Path], allow_outside: bool) -> ColmapModel:
     if not frames:
         raise SceneError(f"{files[0]} has no list of frames, so it has no cameras: export it again")
     train, test = _listed(head, frames)
+    if train or test:  # the others, where one list stands alone
+        train, test = train or set(frames) - test, test or set(frames) - train
     for file in files[1:]:
         _, tests = _frames(file, allow_outside)
         # BlenderNeRF leaves test photos to be rendered: none is there, and the nearest names are those of train photos.

@@ -97,6 +97,18 @@ def test_images_that_cannot_be_read_are_named(tmp_path: Path, text: str, message
         read_images(path)
 
 
+def test_labels_with_numbers_are_no_points(tmp_path: Path) -> None:
+    path = tmp_path / "images.txt"
+    path.write_text("".join(f"{number} {POSE} 1 my frame {number:04}\n\n" for number in range(1, 6)))
+    assert [image.name for image in read_images(path)] == [f"my frame {number:04}" for number in range(1, 6)]
+
+
+def test_sizes_are_rounded(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.txt"
+    path.write_text("1 PINHOLE 79.99999 60.00001 80 80 40 30\n")
+    assert read_cameras(path)[0][2:4] == (80, 60)
+
+
 def test_the_camera_models_are_those_of_colmap() -> None:
     pycolmap = import_pycolmap()
     known = {name: model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}

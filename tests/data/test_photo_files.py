@@ -93,6 +93,12 @@ def test_maps_are_not_taken_for_photos_that_are_gone(tmp_path: Path) -> None:
     assert named["my_masks/1.PNG"] == tmp_path / "my_masks/1.png"
 
 
+def test_photos_that_are_named_in_a_folder_of_small_ones_are_small_already(tmp_path: Path) -> None:
+    write(tmp_path / "images_4", "1.jpg")
+    assert photo_folder(tmp_path, "images_4", 4, ["1.jpg"]) == (tmp_path / "images_4", 1)
+    assert photo_folder(tmp_path, "images_4", 2, ["1.jpg"]) == (tmp_path / "images_4", 2)
+
+
 @pytest.mark.parametrize("place", [".", "input", "colmap/pictures", "sparse/0"])
 def test_the_only_folder_that_has_the_photos_is_used(tmp_path: Path, place: str) -> None:
     names = ["cam/1.jpg", "cam/2.jpg"]

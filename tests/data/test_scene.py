@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -23,7 +24,7 @@ from transforms_scenes import write_blender, write_nerfstudio
 from nsvq_lightning.data import scene as scene_module
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_models
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.data.images import ImageHead
+from nsvq_lightning.data.images import ImageHead, Picture
 from nsvq_lightning.data.photo_files import photos_below
 from nsvq_lightning.data.points import RANDOM_POINTS, in_picture, projected
 from nsvq_lightning.data.reconstruct import reconstruct
@@ -579,6 +580,57 @@ def test_opaque_photos_of_such_scenes_have_the_background_that_they_show(
     scene = load_scene(root)
     assert scene.white == white
     assert (scene.view(4).image[:, :24] == behind).all()
+
+
+def test_opaque_photos_with_an_alpha_channel_have_the_background_that_they_show(
+    demo_scene: Path, tmp_path: Path
+) -> None:
+    root = write_blender(demo_scene, tmp_path / "lego")
+    for path in root.glob("*/*.png"):  # as Blender writes them
+        photo = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        photo[:2] = 30
+        photo[..., 3] = 255
+        assert cv2.imwrite(str(path), photo)
+    assert not load_scene(root).white
+    first = load_scene(root).images.sources[0].path
+    first.write_bytes(first.read_bytes()[:60])
+    assert not load_scene(root).white
+
+
+def walls(rooms: int) -> Any:
+    """Rooms in a row, 4 units apart, with noise on the walls between them; a photo of each wall, far ones behind it."""
+    rng, width = np.random.default_rng(0), 64
+    cameras, pictures, points, colors = [], [], [], []
+    for room in range(rooms):
+        texture = cv2.resize(rng.integers(0, 256, (8, 8, 3), np.uint8), (width, width), interpolation=cv2.INTER_CUBIC)
+        view = torch.eye(4)
+        view[2, 3] = -4.0 * room
+        cameras.append(Camera(torch.tensor([[32.0, 0, 32], [0, 32, 32], [0, 0, 1]]), view, width, width))
+        pictures.append(Picture(torch.from_numpy(texture), None))
+        at = rng.integers(2, width - 2, (200, 2))
+        points.append(np.c_[(at + 0.5 - 32) / 32 * 3, np.full(200, 4.0 * room + 3)])
+        colors.append(texture[at[:, 1], at[:, 0]] / 255)
+    places, shown = torch.from_numpy(np.concatenate(points)).float(), torch.from_numpy(np.concatenate(colors)).float()
+    return SimpleNamespace(
+        cloud=True, points=places, colors=shown, train=range(rooms), images=pictures, cameras=cameras
+    )
+
+
+def test_walls_between_rooms_make_no_points_wrong() -> None:
+    scene = walls(16)
+    assert not is_elsewhere(scene)
+    scene.points.neg_()
+    scene.points[:, 2] *= -1
+    assert is_elsewhere(scene)
+
+
+def test_points_that_are_no_numbers_are_left_out(demo_scene: Path, tmp_path: Path) -> None:
+    cloud = cloud_scene(demo_scene, tmp_path / "scene", "right") / "points3D.ply"
+    content = cloud.read_bytes()
+    cloud.write_bytes(content[:-27] + np.float64(np.nan).tobytes() + content[-19:])
+    points = load_scene(cloud.parent).points
+    assert torch.isfinite(points).all()
+    assert len(points) == len(load_scene(demo_scene).points) - 1
 
 
 def test_photos_of_a_model_inside_are_those_beside_it(demo_scene: Path, tmp_path: Path) -> None:

@@ -208,6 +208,11 @@ def test_lists_of_train_and_test_photos_are_followed(
     change(root / "transforms.json", val_filenames=["images/003.png", "images/004.jpeg", 7])
     assert load_scene(root).test == (3,)
     assert "2 of 3 names in val_filenames are of no photo in the file" in caplog.text
+    change(root / "transforms.json", train_filenames=[])
+    assert (load_scene(root).test, len(load_scene(root).train)) == ((3,), 8)
+    change(root / "transforms.json", val_filenames=[], train_filenames=["images/001.png", "images/003.png"])
+    assert (load_scene(root).train, len(load_scene(root).test)) == ((1, 3), 7)
+    change(root / "transforms.json", train_filenames=[f"images/00{i}.png" for i in (0, 1, 2, 5)])
     change(root / "transforms.json", val_filenames=["images/001.png"])
     with pytest.raises(SceneError, match=r"001\.png is a train and a test photo"):
         load_scene(root)
