@@ -306,6 +306,7 @@ def load_scene(
         raise (NoPhotosError if len(lost) == len(names) else SceneError)(
             f"{len(lost)} of {len(names)} images of the model are not in {folder}, first {lost[0]}: "
             "copy the photos that COLMAP was run on into that folder, under the same names"
+            f"{', or leave factor out' if divisor == 1 and factor else ''}"
         )
     mask_files: list[Path | None] = [None] * len(views)
     if masks is not None:
@@ -386,28 +387,31 @@ def _image_sources(
         log.warning("%d of %d photos %s", others, len(heads), OTHER_SHAPE)
     kinds = [(image.camera_id, head.size) for image, head in zip(model.images, heads, strict=True)]
     keep_maps = len(set(kinds)) <= MAX_CAMERAS_WITH_MAPS
-    lenses = {}
+    lenses, odd = {}, []
     for kind in dict.fromkeys(kinds):
         number, size = kind
         full, undistortion = rectify(model.cameras[number], *size, keep_maps=keep_maps)
-        _warn_of_lens(number, full, size)
+        odd += _odd_lens(number, full, size)
         lenses[kind] = undistortion, _scaled(full, divisor, max_width)
+    if odd:
+        log.warning("%s%s", odd[0], f" ({len(odd) - 1} more are odd)" if odd[1:] else "")
     return [
         ImageSource(path, head.size, *lenses[kind], head.orientation, mask, head.has_alpha, model.synthetic)
         for path, head, kind, mask in zip(paths, heads, kinds, masks, strict=True)
     ]
 
 
-def _warn_of_lens(number: int, lens: Pinhole, size: tuple[int, int]) -> None:
-    """Warn of numbers that lenses hardly have, and of undistortion that leaves less than half of photos of a size."""
+def _odd_lens(number: int, lens: Pinhole, size: tuple[int, int]) -> list[str]:
+    """What numbers lenses hardly have, or that undistortion leaves less than half of photos of a size, if so."""
     (fx, _, cx), (_, fy, cy) = lens.K[:2].tolist()
     is_usual = 0.5 < fx / fy < 2 and 0.1 < cx / lens.width < 0.9 and 0.1 < cy / lens.height < 0.9
-    if not is_usual or 2 * lens.width * lens.height < math.prod(size):
-        log.warning(
-            f"camera {number} is odd: focal lengths {fx:.4g} and {fy:.4g}, centre ({cx:.4g}, {cy:.4g}), and "
-            f"{lens.width}x{lens.height} of {size[0]}x{size[1]} pixels are left without distortion: were photos "
-            "scaled, cropped or turned after it was calibrated?"
-        )
+    if is_usual and 2 * lens.width * lens.height >= math.prod(size):
+        return []
+    return [
+        f"camera {number} is odd: focal lengths {fx:.4g} and {fy:.4g}, centre ({cx:.4g}, {cy:.4g}), and "
+        f"{lens.width}x{lens.height} of {size[0]}x{size[1]} pixels are left without distortion: were photos "
+        "scaled, cropped or turned after it was calibrated?"
+    ]
 
 
 def _scaled(lens: Pinhole, divisor: int, max_width: int | None) -> Pinhole:

@@ -260,6 +260,15 @@ def test_size_and_intrinsics(
     assert view.camera.intrinsics == pytest.approx((30 * x, 31 * y, 21 * x, 15 * y))
 
 
+def test_small_photos_of_other_names_are_told_with_the_way_out(make_scene: SceneFactory) -> None:
+    root = make_scene()
+    (root / "images_4").mkdir()
+    for number in range(9):
+        assert cv2.imwrite(str(root / "images_4" / f"image{number}.png"), np.zeros((8, 10, 3), np.uint8))
+    with pytest.raises(SceneError, match="under the same names, or leave factor out"):
+        load_scene(root, factor=4)
+
+
 def test_downscaled_folder_is_used_where_there_is_one(make_scene: SceneFactory) -> None:
     root = make_scene()
     (root / "images_4").mkdir()

@@ -218,6 +218,17 @@ def test_lists_of_train_and_test_photos_are_followed(
         load_scene(root)
 
 
+def test_odd_cameras_of_all_photos_are_told_once(
+    make_scene: SceneFactory, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = write_pinhole(make_scene(), tmp_path / "json")
+    frames = json.loads((root / "transforms.json").read_text())["frames"]
+    change(root / "transforms.json", frames=[{**frame, "cx": 0.1 + k / 100} for k, frame in enumerate(frames)])
+    load_scene(root)
+    assert caplog.text.count("camera ") == 1
+    assert "after it was calibrated? (8 more are odd)" in caplog.text
+
+
 def test_a_colmap_model_comes_first_and_any_can_be_chosen(make_scene: SceneFactory, tmp_path: Path) -> None:
     root = write_pinhole(make_scene(views=9), tmp_path / "json")
     shutil.copytree(make_scene("five", views=5) / "sparse", root / "sparse")
