@@ -72,6 +72,12 @@ def same_shape(one: Size, other: Size) -> bool:
     return abs(one[0] * other[1] - one[1] * other[0]) < max(ROUNDED * one[1] * other[0], *other)
 
 
+def is_transparent(path: Path) -> bool:
+    """Whether any pixel of an image that can be read is transparent; an alpha channel alone does not say so."""
+    with Image.open(path) as image:
+        return min(image.convert("RGBA").getchannel("A").tobytes()) < 255
+
+
 def head_for(path: Path, expected: Size, as_shown: bool = False) -> ImageHead:
     """The head of a photo for a camera of some size: with the orientation to apply, and the size that it then has.
 

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, NoPhotosError, Pinhole, SceneError, larger_models
-from nsvq_lightning.data.images import ImageSource, ImageStore, Picture, head_for, high_pass, same_shape
+from nsvq_lightning.data.images import ImageSource, ImageStore, Picture, head_for, high_pass, is_transparent, same_shape
 from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder
 from nsvq_lightning.data.points import in_picture, projected, random_points
 from nsvq_lightning.data.transforms import read_poses
@@ -354,10 +354,11 @@ def load_scene(
 
 
 def _in_front_of_white(images: ImageStore) -> bool:
-    """Whether photos of objects have white behind these, as transparent ones do, by the first row of the first one."""
-    for index in range(len(images.sources)):
+    """Whether photos of objects have white behind these: transparent ones, and by its first row the first of others."""
+    for index, source in enumerate(images.sources):
         with suppress(SceneError):  # it is left out later
-            return bool(np.quantile(images[index].image[0], 0.75) > 250)
+            white = np.quantile(images[index].image[0], 0.75) > 250
+            return bool(white) or (source.has_alpha and is_transparent(source.path))
     return False
 
 

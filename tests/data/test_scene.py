@@ -576,6 +576,15 @@ def test_scenes_of_nerf_synthetic_are_in_front_of_white(demo_scene: Path, tmp_pa
         trainer.fit(SplatModule(sh_degree=0, codebooks=None, background="black"), ColmapDataModule(str(root)))
 
 
+def test_transparent_photos_that_their_object_fills_are_in_front_of_white(demo_scene: Path, tmp_path: Path) -> None:
+    root = write_blender(demo_scene, tmp_path / "lego")
+    for path in root.glob("*/*.png"):
+        photo = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        photo[:2] = 40, 40, 40, 255
+        assert cv2.imwrite(str(path), photo)
+    assert load_scene(root).white
+
+
 @pytest.mark.parametrize(("behind", "white"), [(0, False), (240, False), (255, True)])
 def test_opaque_photos_of_such_scenes_have_the_background_that_they_show(
     demo_scene: Path, tmp_path: Path, behind: int, white: bool
