@@ -1,7 +1,7 @@
 """What callbacks share: the check of the module, acting once per step, the folder of the run, the search for NaN."""
 
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 from lightning.pytorch import Callback, Trainer
@@ -194,6 +194,6 @@ def keep_finite_splats(module: SplatModule) -> None:
         return
     for quantizer in module.quantizers.values():
         if (held := held_codes(quantizer, len(kept))) is not None:
-            cast(Any, quantizer).hold(held[kept])
+            quantizer.hold(held[kept])  # type: ignore[attr-defined]
         if len(quantizer.codes) > 0:
             quantizer.freeze(quantizer.codes[kept])

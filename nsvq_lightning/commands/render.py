@@ -122,7 +122,7 @@ def _path(
         known = cameras or likely_cameras(splats, 1)  # of what the path does not say
         near, limits = min(camera.near for camera in known), known[0].slope_limits
         path, own = read_camera_path(Path(kind))
-        cameras = [replace(camera, near=near, slope_limits=limits) for camera in path]
+        cameras = [replace(camera, near=near, limits=limits) for camera in path]
         fps = options.fps or own
     elif not cameras:
         if kind != "orbit":

@@ -27,9 +27,9 @@ class Camera:
         width: Image width in pixels.
         height: Image height in pixels.
         near: Splats whose centre is nearer than this along the viewing axis are not seen, scene units.
-        slope_limits: Lowest and highest x/z, then y/z, at which a Jacobian is evaluated: by default a margin beyond the
-            image. A picture of another shape or focal length than those of training needs theirs: beyond, splats were
-            never stretched so far, and would lie as streaks over what is in view.
+        limits: The :attr:`slope_limits` of another picture that are to hold in this one. One of another shape or focal
+            length than those of training needs theirs: beyond, splats were never stretched so far, and would lie as
+            streaks over what is in view.
         intrinsics: ``(fx, fy, cx, cy)`` in pixels.
         packed_view: Rotation row by row, translation and camera position: 15 numbers in float64, the same on every
             machine.
@@ -44,7 +44,7 @@ class Camera:
     width: int
     height: int
     near: float = NEAR
-    slope_limits: tuple[float, ...] = ()
+    limits: tuple[float, ...] = ()
     intrinsics: tuple[float, float, float, float] = field(init=False, repr=False)
     packed_view: tuple[float, ...] = field(init=False, repr=False)
 
@@ -73,17 +73,21 @@ class Camera:
         if not ((turn @ turn.T - torch.eye(4)).abs().max() < 0.01 and turn.det() > 0):
             shape = "a rotation and a translation, over 0 0 0 1: is it transposed, mirrored or scaled?"
             raise ValueError(f"Camera.viewmat must be world to camera, {shape}")
-        if not self.slope_limits:
-            margin_x, margin_y = 0.5 * FRUSTUM_MARGIN * self.width / fx, 0.5 * FRUSTUM_MARGIN * self.height / fy
-            vars(self)["slope_limits"] = (
-                -cx / fx - margin_x, (self.width - cx) / fx + margin_x,
-                -cy / fy - margin_y, (self.height - cy) / fy + margin_y,
-            )  # fmt: skip
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.width, self.height
+
+    @property
+    def slope_limits(self) -> tuple[float, ...]:
+        """Lowest and highest x/z, then y/z, at which a Jacobian is evaluated: those given, or beyond the image."""
+        fx, fy, cx, cy = self.intrinsics
+        margin_x, margin_y = 0.5 * FRUSTUM_MARGIN * self.width / fx, 0.5 * FRUSTUM_MARGIN * self.height / fy
+        return self.limits or (
+            -cx / fx - margin_x, (self.width - cx) / fx + margin_x,
+            -cy / fy - margin_y, (self.height - cy) / fy + margin_y,
+        )  # fmt: skip
 
     @property
     def position(self) -> Tensor:
@@ -116,7 +120,7 @@ def camera_of(
         width: Pixels.
         height: Pixels.
         near: Distance of the near plane, scene units.
-        limits: Its slope limits; a margin beyond the image by default.
+        limits: Slope limits of another picture, if they are to hold.
     """
     fx, fy, cx, cy = map(float, lens)
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

@@ -5,7 +5,7 @@ extent is 5, as it is in most scenes of COLMAP: learning rates, first sizes and 
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -73,9 +73,7 @@ class Frame:
         packed = np.array(camera.packed_view)
         view = viewmat_of(packed[:9].reshape(3, 3), self.points(packed[None, 12:])[0])
         near = float(f"{camera.near / self.unit:.6g}")
-        here = Camera(camera.K.double(), torch.from_numpy(view), *camera.size, near)
-        if not np.allclose(here.slope_limits, camera.slope_limits):  # not those of its own picture
-            here = replace(here, slope_limits=camera.slope_limits)
+        here = Camera(camera.K.double(), torch.from_numpy(view), *camera.size, near, camera.limits)
         return here.to(dtype=torch.float32)
 
     def sampling(self, sampling: Sampling | None) -> Sampling | None:

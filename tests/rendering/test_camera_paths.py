@@ -288,7 +288,7 @@ def test_a_wide_picture_shows_what_a_photo_of_portrait_shape_shows() -> None:
     wide = reframed(photo, 160, 80)
     middle, expected = render(splats, wide).image[:, 60:100], render(splats, photo).image
     torch.testing.assert_close(middle, expected, atol=1e-4, rtol=0)
-    own = render(splats, replace(wide, slope_limits=())).image[:, 60:100]
+    own = render(splats, replace(wide, limits=())).image[:, 60:100]
     assert (own - expected).abs().max() > 0.02
     moved = replace(wide, viewmat=torch.eye(4))
     for each in (*orbit([wide, moved], 3), *smooth_path([wide, moved], 3), Frame(2.0).camera(wide)):

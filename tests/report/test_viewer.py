@@ -262,7 +262,7 @@ def test_a_wide_window_shows_a_photo_of_portrait_shape_as_it_was_trained(
     wide = reframed(camera, 240, 96)
     _shown(tab, (tmp_path / "viewer.html").as_uri(), wide.width, wide.height)
     assert _psnr(tab, scene_file, wide) > 55
-    assert _psnr(tab, scene_file, replace(wide, slope_limits=())) < 45
+    assert _psnr(tab, scene_file, replace(wide, limits=())) < 45
 
 
 @needs_chromium

@@ -47,8 +47,7 @@ class Workload:
         K[0, 2] -= left
         K[1, 2] -= top
         gradient = self.image_gradient[top : top + height, left : left + width].contiguous()
-        camera = replace(self.camera, K=K, width=width, height=height, slope_limits=())
-        return replace(self, camera=camera, image_gradient=gradient)
+        return replace(self, camera=replace(self.camera, K=K, width=width, height=height), image_gradient=gradient)
 
     def to(self, device: torch.device | str) -> "Workload":
         """The workload with its splats and gradient on a device; the camera stays where it is."""
