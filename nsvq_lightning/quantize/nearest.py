@@ -25,8 +25,8 @@ from nsvq_lightning.quantize.box_search import MAX_DIM, box_search, code_distanc
 from nsvq_lightning.quantize.scores import score_search
 
 
-def check_rows(x: Tensor, codebook: Tensor) -> None:
-    """Refuse rows and codes that do not fit together.
+def check_rows(x: Tensor, codebook: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows and codes, detached and contiguous; those that do not fit together are refused.
 
     Raises:
         ValueError: ``x`` is not ``[N, D]``, ``codebook`` not ``[K, D]`` with at least one code.
@@ -38,6 +38,7 @@ def check_rows(x: Tensor, codebook: Tensor) -> None:
         raise ValueError(f"the codebook has no code, shape {list(codebook.shape)}; fit it first")
     if x.dtype != codebook.dtype or not x.dtype.is_floating_point:
         raise TypeError(f"x and codebook must have one floating-point dtype, got {x.dtype} and {codebook.dtype}")
+    return x.detach().contiguous(), codebook.detach().contiguous()
 
 
 def nearest_reference(x: Tensor, codebook: Tensor) -> Tensor:
@@ -52,7 +53,7 @@ def nearest_reference(x: Tensor, codebook: Tensor) -> Tensor:
     Returns:
         Codes ``[N]`` int64; of equally near codes the lowest.
     """
-    check_rows(x, codebook)
+    x, codebook = check_rows(x, codebook)
     return torch.cat([least(distances) for _, distances in distance_parts(x, codebook)])
 
 
@@ -87,8 +88,7 @@ def nearest(x: Tensor, codebook: Tensor) -> Tensor:
         ValueError: The shapes do not fit together, or there is no code.
         TypeError: The dtypes differ or are not floating point.
     """
-    check_rows(x, codebook)
-    x, codebook = x.detach().contiguous(), codebook.detach().contiguous()
+    x, codebook = check_rows(x, codebook)
     kernels = kernels_for(x)
     if kernels == "cpu":
         rows, codes = x.numpy(), codebook.numpy()
@@ -120,18 +120,17 @@ def cheapest(x: Tensor, codebook: Tensor, rates: Tensor, prices: Tensor) -> Tens
         ValueError: The shapes do not fit together, or there is no code.
         TypeError: The dtypes of ``x`` and ``codebook`` differ or are not floating point.
     """
-    check_rows(x, codebook)
+    x, codebook = check_rows(x, codebook)
     if rates.shape != codebook.shape[:1] or prices.shape != x.shape[:1]:
         raise ValueError(
             f"rates [K] and prices [N] must belong to {len(codebook)} codes and {len(x)} rows, got "
             f"{list(rates.shape)} and {list(prices.shape)}"
         )
-    x, codebook = x.detach(), codebook.detach()
     if kernels_for(x) != "cpu":
         return cheapest_reference(x, codebook, rates, prices)
     table = _blocks(codebook.numpy(), rates.float().numpy())
     result = np.empty(len(x), np.int64)
-    queries, dearness = x.contiguous().numpy().ravel(), prices.float().contiguous().numpy()
+    queries, dearness = x.numpy().ravel(), prices.float().contiguous().numpy()
     _search_kernel(x.shape[1])(parts_of(len(x), 64), queries, dearness, table, result)
     return torch.from_numpy(result)
 

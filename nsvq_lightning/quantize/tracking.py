@@ -144,13 +144,12 @@ class NearestTracker:
                 checked on the CPU alone).
             TypeError: The dtypes differ or are not floating point, or rows are not int64.
         """
-        check_rows(x, codebook)
+        x, codebook = check_rows(x, codebook)
         if rows is not None and rows.dim() != 1:
             raise ValueError(f"rows must have shape [V], got {list(rows.shape)}")
         kernels = kernels_for(x)
         if kernels is None:
             return nearest(x if rows is None else x.index_select(0, rows), codebook)
-        x, codebook = x.detach().contiguous(), codebook.detach().contiguous()
         chosen = torch.arange(len(x), device=x.device) if rows is None else rows.contiguous()
         if kernels == "cuda":
             from nsvq_lightning.quantize.cuda.search import DeviceTracker
