@@ -126,8 +126,7 @@ def gradient_of_row(image, gradient, images, ring, y, length, pitch, steps, lane
 def square_errors(thread, threads, image, target, white, height, length, pitch, images, lanes, sums):
     """Every thread adds up the squared differences of each row of a band, into ``sums[2·y]``."""
     own_images, lane = images[thread], simd.load(lanes, 0)
-    first, last = share(height, thread, threads)
-    for y in range(first, last):
+    for y in range(*share(height, thread, threads)):
         take_row(image, target, white, own_images, y, height, length, pitch)
         total = simd.broadcast(0)
         for x_ in range(0, length, 16):

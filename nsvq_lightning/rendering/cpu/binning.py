@@ -20,8 +20,7 @@ def _visit_digits(part, parts, count, source, low, shift, histogram, from_ids, t
     row = histogram[part]
     if target is None:
         row[:] = 0
-    first, end = share(count, part, parts)
-    for i in range(first, end):
+    for i in range(*share(count, part, parts)):
         key = get(source, i)
         digit = ((np.int64(key) - low) >> shift) & (DIGITS - 1)
         place = row[digit]

@@ -445,8 +445,7 @@ def total_slots(part, parts, ids, slots, records, integers, sums, g_means2d, wit
     ``with_absgrad`` also writes sums over the pixels ``[N·3]``: Σ |∂L/∂x|, Σ |∂L/∂y| and Σ weight · pixel weight.
     """
     count = ids.shape[0]
-    first, last = share(count, part, parts)
-    for i in range(first, last):
+    for i in range(*share(count, part, parts)):
         row = simd.integer(ids, i)
         clear_between(ids, i, 2, g_means2d)
         if with_absgrad:

@@ -222,8 +222,7 @@ def visible(splats: RawSplats, camera: Camera) -> Tensor:
 @parallel
 def _add(part, parts, tables, gradients, radii, factors):
     sums, views, weights, columns = tables[0], tables[1], tables[-1], len(tables)
-    first, end = share(radii.shape[0], part, parts)
-    for i in range(first, end):
+    for i in range(*share(radii.shape[0], part, parts)):
         if get(radii, i) > 0:
             x = factors[0] * get(gradients, columns * i)
             y = factors[1] * get(gradients, columns * i + 1)
