@@ -19,6 +19,8 @@ SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 # to that error, as nobody sees what is beyond 50 dB.
 LOG_WEIGHT, LEAST_ERROR = 0.016, 1e-5
 C1, C2 = F(SSIM_C1), F(SSIM_C2)
+# Planes of the moments; of the derivatives of SSIM by three of them, blurred p, p² and p·q.
+MOMENTS, DERIVATIVES = 4, 3
 
 
 @inline

@@ -16,7 +16,7 @@ from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat, flat_checked, recycled
 from nsvq_lightning.compute.rows import clear, share
 from nsvq_lightning.quality import formulas
-from nsvq_lightning.quality.formulas import SSIM_RADIUS, check_pair, ssim_window
+from nsvq_lightning.quality.formulas import DERIVATIVES, MOMENTS, SSIM_RADIUS, check_pair, ssim_window
 
 # The taps of the window, from the middle outwards.
 TAPS = tuple(F(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
@@ -24,8 +24,6 @@ TAPS = tuple(F(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
 PAD = 16
 RING = 2 * SSIM_RADIUS + 1
 IMAGES = 2
-MOMENTS = 4
-DERIVATIVES = 3
 
 
 @inline

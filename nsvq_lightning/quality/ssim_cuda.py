@@ -17,14 +17,13 @@ from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.formulas import for_triton
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quality import formulas as shared
-from nsvq_lightning.quality.formulas import SSIM_RADIUS, check_pair, ssim_window
+from nsvq_lightning.quality.formulas import DERIVATIVES, MOMENTS, SSIM_RADIUS, check_pair, ssim_window
 
 formulas = for_triton(shared)
 
 # The taps of the window, from the middle outwards.
 TAPS, RADIUS = tl.constexpr(tuple(ssim_window()[SSIM_RADIUS:].tolist())), tl.constexpr(SSIM_RADIUS)
 LOG_WEIGHT, LEAST_ERROR = tl.constexpr(shared.LOG_WEIGHT), tl.constexpr(shared.LEAST_ERROR)
-DERIVATIVES = 3
 # Image rows per program: four floats per thread, so that registers suffice for all taps.
 ROWS = 4
 # Floats of each row per program, three to a pixel.
@@ -194,9 +193,6 @@ def gradient_kernel(
     steps = (tl.load(steps), tl.load(steps + 1), tl.load(steps + 2))
     value = formulas.pixel_gradient(raw, p, q, slopes, steps)
     store_at(gradient, at, value * tl.load(scale))
-
-
-MOMENTS = 4
 
 
 def _launch(image: Tensor, target: Tensor) -> tuple[tuple[int, int], tuple[int, int], bool]:
