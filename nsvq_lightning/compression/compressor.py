@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 from warnings import catch_warnings
 
 import numpy as np
@@ -22,7 +22,7 @@ from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.datamodule import SceneDataModule
 from nsvq_lightning.data.scene import Scene, check_cameras, spread
-from nsvq_lightning.io.compressed import CompressedScene, on_white, renderer
+from nsvq_lightning.io.compressed import AnySplats, CompressedScene, on_white, renderer
 from nsvq_lightning.io.morton import spatial_order
 from nsvq_lightning.io.nsvq.file import decode, encode
 from nsvq_lightning.io.nsvq.header import frame, unframe
@@ -37,9 +37,6 @@ from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.training.trainer import SplatTrainer
-
-if TYPE_CHECKING:
-    from nsvq_lightning.io.compressed import AnySplats
 
 log = logging.getLogger(__name__)
 
@@ -439,7 +436,7 @@ class Compressor:
 
 @torch.inference_mode(False)
 def compress(
-    splats: "AnySplats",
+    splats: AnySplats,
     cameras: Sequence[Camera] = (),
     photos: Sequence[Tensor] = (),
     *,

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from nsvq_lightning.rendering.rasterize import Render
     from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors
 
-    AnySplats: TypeAlias = "CompressedScene | SplatTensors | Mapping[str, Any] | Module"
+AnySplats: TypeAlias = "CompressedScene | SplatTensors | Mapping[str, Any] | Module"
 
 log = logging.getLogger(__name__)
 
@@ -105,7 +105,7 @@ class CompressedScene:
             raise ValueError(f"cameras must be at most {MAX_CAMERAS} finite positions and focal lengths above 0")
 
     @classmethod
-    def from_splats(cls, splats: "AnySplats", **header: Any) -> "CompressedScene":
+    def from_splats(cls, splats: AnySplats, **header: Any) -> "CompressedScene":
         """A copy of splats, on any device, without any codebook: valid, but not compressed.
 
         Args:

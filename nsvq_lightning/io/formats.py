@@ -10,14 +10,13 @@ import numpy as np
 
 from nsvq_lightning.io import glb, lod, ply, sog, splat, spz, usda
 from nsvq_lightning.io.atomic import StrPath
-from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.compressed import AnySplats, CompressedScene
 from nsvq_lightning.io.errors import Json, naming_file
 from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.header import describe_nsvq
 from nsvq_lightning.io.nsvq.precision import Storage
 
 if TYPE_CHECKING:
-    from nsvq_lightning.io.compressed import AnySplats
     from nsvq_lightning.splats.splats import Splats
 
 logger = logging.getLogger(__name__)
@@ -70,7 +69,7 @@ def read_scene(path: StrPath) -> CompressedScene:
     return replace(kept, stored_bytes=scene.stored_bytes or path.stat().st_size)
 
 
-def save(scene: "AnySplats", path: StrPath, storage: Storage | str | None = None, **options: Any) -> int:
+def save(scene: AnySplats, path: StrPath, storage: Storage | str | None = None, **options: Any) -> int:
     """Save a scene in any supported format; splats with NaN or infinite values are left out with a warning.
 
     Args:
