@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import add_root, positive, scene_with_views
 from nsvq_lightning.io.atomic import make_folder_of, write_bytes
-from nsvq_lightning.io.formats import FORMATS
+from nsvq_lightning.io.formats import FORMATS, read_scene, save, suffix_of
 from nsvq_lightning.io.lod import NAME
 from nsvq_lightning.io.nsvq.precision import DEFAULT_LEVEL, LEVELS, Storage
 from nsvq_lightning.splats.attributes import DEFAULT_SIZE, SIZES
@@ -93,8 +93,6 @@ def run(options: Namespace) -> int:
         ValueError: The scene cannot be used, or a limit cannot be met.
         OSError: A file cannot be read or written.
     """
-    from nsvq_lightning.io.formats import read_scene, suffix_of
-
     streamed = suffix_of(options.output) == NAME
     wrong = ""
     if not streamed and suffix_of(options.output) != ".nsvq":
@@ -124,7 +122,6 @@ def run(options: Namespace) -> int:
 def _write_levels(options: Namespace, compressor: "Compressor", most: int) -> None:
     """Write a streamed SOG of levels of detail, the finest of ``most`` splats."""
     from nsvq_lightning.compression.compressor import Setting
-    from nsvq_lightning.io.formats import save
 
     scene = compressor.scene
     # Where there are few, the last levels would be alike.
