@@ -205,10 +205,9 @@ def known_views(path: Path, root: Path | None, scene: "CompressedScene | None" =
     from nsvq_lightning.data.scene import check_cameras
 
     cameras, photos = _found_views(path, root, scene.origin if scene else (0, 0, 0))
-    if not (scene and cameras):
-        return cameras, photos
     try:
-        check_cameras(list(cameras.values()), scene.means, None if root else scene.cameras)
+        if scene and cameras:
+            check_cameras(list(cameras.values()), scene.means, None if root else scene.cameras)
     except ValueError as error:
         log.warning("%s: the cameras of %s are not used: %s", path, root or "the folders beside it", error)
         return {}, None
