@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
-from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.compressed import CompressedScene, slices
 from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
 from nsvq_lightning.io.numbers import FLAT, Clamped, finite_logits, finite_logs, logits_of, opacity_of
 from nsvq_lightning.io.placing import FAR
@@ -382,9 +382,8 @@ def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, 
     vertices = np.fromfile(path, header.dtype, header.count, offset=header.offset)
     bounds = np.concatenate([*read_ply_columns(path, chunk, _bounds(chunk))])
     rows = {name: np.empty((header.count, dim), np.float32) for name, dim in attribute_dims(0).items()}
-    for start in range(0, header.count, _ROWS):
-        several = slice(start, start + _ROWS)
-        for name, part in _of_chunks(vertices[several], bounds[start // _CHUNK :]).items():
+    for several in slices(header.count):
+        for name, part in _of_chunks(vertices[several], bounds[several.start // _CHUNK :]).items():
             rows[name][several] = part
     if sh_degree:
         names = _needed(header, sh_degree)["shN"]
