@@ -11,12 +11,8 @@ if TYPE_CHECKING:
     from nsvq_lightning.rendering.frame import Frame
 
 # Rotations that turn COLMAP's up, -y, to an axis; x stays.
-UP_AXES = {
-    "y": np.diag([1.0, -1.0, -1.0]),
-    "minus-y": np.eye(3),
-    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
-    "minus-z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-}
+_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+UP_AXES = {"y": np.diag([1.0, -1.0, -1.0]), "minus-y": np.eye(3), "z": _Z, "minus-z": _Z.T}
 
 
 def turn_up(up: Float64s, axis: str) -> Float64s:
