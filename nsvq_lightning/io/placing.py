@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, turned
+from nsvq_lightning.splats.conventions import Float64s, turned
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.frame import Frame
@@ -70,10 +70,6 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
         raise ValueError(f"{linear.tolist()} is no scaled rotation: splats can be turned and scaled evenly only")
     rotation = linear / size
     harmonics = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
-
-    def turned_harmonics(rows: Float32s) -> Arrays:
-        return (harmonics @ rows.reshape(len(rows), len(harmonics), 3)).reshape(rows.shape)
-
     means, origin = scene.means @ linear.T, linear @ scene.origin
     if any(scene.origin) or np.linalg.norm(shift) > FAR * middle_of(means)[1] > 0:
         origin += shift  # which moves, then, and not what is relative to it
@@ -84,7 +80,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
         {
             "scales": lambda rows: rows + np.log(size),
             "quats": lambda rows: turned(rows, rotation),
-            "shN": turned_harmonics,
+            "shN": lambda rows: (harmonics @ rows.reshape(len(rows), len(harmonics), 3)).reshape(rows.shape),
         },
         means=(means + shift).astype(np.float32),
         origin=tuple(origin.tolist()),
