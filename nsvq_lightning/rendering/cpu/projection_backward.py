@@ -13,13 +13,9 @@ from nsvq_lightning.rendering.cpu.harmonics import AHEAD, coefficients_of, color
 @inline
 def clear_rows(first, last, stride, gradients):
     """Zero the gradients of rows that are not in view."""
-    g_means, g_quats, g_scales, g_logits, g_sh0, g_shN = gradients
-    clear(g_means, 3 * first, 3 * last)
-    clear(g_quats, 4 * first, 4 * last)
-    clear(g_scales, 3 * first, 3 * last)
-    clear(g_logits, first, last)
-    clear(g_sh0, 3 * first, 3 * last)
-    clear(g_shN, stride * first, stride * last)
+    widths = (3, 4, 3, 1, 3, stride)
+    for k in range(6):
+        clear(gradients[k], widths[k] * first, widths[k] * last)
 
 
 @parallel
