@@ -16,7 +16,7 @@ UP_AXES = {"y": np.diag([1.0, -1.0, -1.0]), "minus-y": np.eye(3), "z": _Z, "minu
 
 
 def turn_up(up: Float64s, axis: str) -> Float64s:
-    """The rotation ``[3, 3]`` that turns a direction to an axis: the shortest way to -y, then around x.
+    """The rotation ``[3, 3]`` that turns a direction to an axis: to -y, x as near to itself as may be, then around x.
 
     Args:
         up: Direction ``[3]`` of length 1.
@@ -24,7 +24,7 @@ def turn_up(up: Float64s, axis: str) -> Float64s:
     """
     from scipy.spatial.transform import Rotation
 
-    lift, _ = Rotation.align_vectors([0.0, -1.0, 0.0], up)
+    lift, _ = Rotation.align_vectors([[0, -1, 0], [1, 0, 0]], [up, [1, 0, 0]], [np.inf, 1])
     return UP_AXES[axis] @ lift.as_matrix()  # type: ignore[no-any-return]
 
 
@@ -33,7 +33,7 @@ HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
 # From so many times the distance that four fifths of the splats have from their middle, float32 would be too coarse.
-FAR = 100.0
+FAR = 1000.0
 
 
 def rotated(scene: CompressedScene, rotation: Float64s) -> CompressedScene:

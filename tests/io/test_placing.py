@@ -64,7 +64,7 @@ def test_a_scene_keeps_its_detail_on_a_map() -> None:
     np.testing.assert_array_equal(there.means, scene.means)
     assert there.origin == tuple(shift)
     near = moved(scene, np.c_[np.eye(3), [4.0, 0.0, -2.0]])
-    assert near.origin == scene.origin
+    assert near.origin == moved(scene, np.c_[np.eye(3), [300.0, 0.0, 0.0]]).origin == scene.origin
     np.testing.assert_allclose(near.means, scene.means + np.array([4.0, 0.0, -2.0]), atol=1e-6)
 
 
@@ -91,6 +91,8 @@ def test_up_becomes_the_axis(axis: str, up: list[float]) -> None:
     assert np.linalg.det(rotation) == pytest.approx(1)
     expected = {"y": [0, 1, 0], "minus-y": [0, -1, 0], "z": [0, 0, 1], "minus-z": [0, 0, -1]}[axis]
     np.testing.assert_allclose(rotation @ direction, expected, atol=1e-6)
+    if not up[0]:
+        np.testing.assert_allclose(rotation[0], [1, 0, 0], atol=1e-9)  # x stays, as from right, up, back
 
 
 @pytest.mark.parametrize("up", [[0.0, -1, 0], [0, 0, 1], [0.36, -0.48, 0.8]])
