@@ -199,5 +199,8 @@ def _measure(source: Path, output: Path, root: Path | None) -> None:
 
     original = formats.read_scene(source)
     measure = Measure(original.tensors(), views_of(source, original, MEASURED, root), renderer(original))
-    error = measure.error(formats.read_scene(output).tensors())
+    written = formats.read_scene(output)
+    if formats.suffix_of(output) == ".glb":  # which may have its origin in its positions
+        written = written.relative_to(original.origin)
+    error = measure.error(written.tensors())
     say(f"  {written_error(measure, error, source.name)}")

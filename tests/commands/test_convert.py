@@ -89,6 +89,16 @@ def test_measuring_says_how_the_pictures_differ(tmp_path: Path, capsys: pytest.C
     assert "error 0 (inf dB against a.nsvq in 24 pictures)" in capsys.readouterr().out
 
 
+def test_a_place_that_a_reader_puts_into_positions_is_no_difference(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(replace(ball(50, 1), origin=(30.0, 4.0, -20.0)), tmp_path / "a.nsvq", "paper")
+    assert main([str(tmp_path / "a.nsvq"), str(tmp_path / "b.glb"), "--measure"]) == 0
+    decibels = re.search(r"\((\S+) dB against", capsys.readouterr().out)
+    assert decibels
+    assert float(decibels[1]) > 80
+
+
 @pytest.mark.parametrize(
     ("arguments", "message", "status"),
     [
