@@ -60,7 +60,7 @@ class Grid:
 
     def cells(self, means: Float32s) -> tuple[Int64s, Bools]:
         """Cell of each position ``[N, 3]``, 0 for those outside; and which ``[N]`` are inside."""
-        cells = np.floor(means.astype(np.float64) / self.step) - self.base
+        cells = np.floor(means.astype(np.float64, "C") / self.step) - self.base
         inside = np.logical_and.reduce((cells >= 0) & (cells < 1 << AXIS_BITS), axis=1)
         return np.where(inside[:, None], cells, 0).astype(np.int64), inside
 

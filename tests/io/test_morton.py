@@ -123,3 +123,4 @@ def test_degenerate_scenes_have_a_grid(means: np.ndarray) -> None:
     assert inside.all()
     back = grid.centers(cells, np.full(len(means), AXIS_BITS))
     np.testing.assert_allclose(back, means, rtol=1e-5, atol=1e-9)
+    assert grid.cells(np.asfortranarray(means))[0].flags.c_contiguous
