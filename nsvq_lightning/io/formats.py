@@ -97,9 +97,12 @@ def save(scene: AnySplats, path: StrPath, storage: Storage | str | None = None, 
         raise ValueError(f"cannot write {path}: {suffix_of(path)} is only read")
     with naming_file(path):
         scene = CompressedScene.from_splats(scene).finite()
-    lost = scene.background if suffix_of(path) == ".glb" else (*scene.background, *scene.origin)
-    if any(lost) and not entry.native:
-        logger.warning(f"{path}: not stored: origin {scene.origin}, background {scene.background}; set in the viewer")
+    lost = {"background": scene.background}
+    if suffix_of(path) != ".glb":
+        lost = {"origin": scene.origin} | lost
+    if any(map(any, lost.values())) and not entry.native:
+        told = ", ".join(f"{name} {value}" for name, value in lost.items())
+        logger.warning(f"{path}: not stored: {told}; set in the viewer")
     storage = None if storage is None else Storage.of(storage)
     if entry.native:
         options["storage"] = storage
