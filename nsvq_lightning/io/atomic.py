@@ -30,11 +30,12 @@ def atomic_path(path: StrPath) -> Iterator[Path]:
 
     Raises:
         FileNotFoundError: The folder does not exist.
-        IsADirectoryError: ``path`` is a folder.
+        IsADirectoryError: ``path`` is a folder, a pipe or a device.
     """
     target = Path(os.path.realpath(path))
-    if target.is_dir():
-        raise IsADirectoryError(f"cannot write {path}: it is a folder; add a file name")
+    if target.exists() and not target.is_file():  # a pipe or a device would be replaced, too
+        kind = "a folder; add a file name" if target.is_dir() else "no ordinary file"
+        raise IsADirectoryError(f"cannot write {path}: it is {kind}")
     if not target.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {target.parent} does not exist; create it first")
     # Not mkstemp: it creates files that only their owner can read, and renaming would keep that.

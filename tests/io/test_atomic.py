@@ -28,6 +28,14 @@ def test_failure_keeps_the_old_file_and_leaves_no_litter(tmp_path: Path) -> None
     assert os.listdir(tmp_path) == ["scene.ply"]
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes with names")
+def test_a_pipe_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(pipe := tmp_path / "scene.ply")
+    with pytest.raises(OSError, match="it is no ordinary file"), atomic_write(pipe):
+        pass
+    assert pipe.is_fifo()
+
+
 def test_a_full_disk_is_told_with_the_file(tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
 
