@@ -265,7 +265,7 @@ class Compressor:
             try:
                 setting = setting_for(int(asked), splats, self.scene.sh_degree, self.parts)
             except ValueError:
-                if needed:
+                if needed and before is None:  # later ones are of estimates
                     raise
                 break
             found = self._fitting(setting, target)
