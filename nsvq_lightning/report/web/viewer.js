@@ -716,6 +716,8 @@ async function main() {
         schedule();
       } catch (error) {
         say(error.message);
+        version = ""; // to be asked for again
+        await new Promise((resolve) => setTimeout(resolve, 1000 * server.seconds));
       }
     }
   }
@@ -774,7 +776,7 @@ async function main() {
   }
   /** Go to the camera that the address names; returns what to say about it. */
   function follow() {
-    const name = new URLSearchParams(location.hash.slice(1)).get("camera");
+    const name = new URLSearchParams(location.hash.slice(1).replaceAll("+", "%2B")).get("camera");
     const index = name === null ? current : scene.cameras.findIndex((camera) => camera.name === name);
     show(Math.max(index, 0));
     return index < 0 ? `There is no camera ${name} here; this is the first one.` : "";
