@@ -85,7 +85,7 @@ def seen_by(cameras: Sequence[Camera], means: Float32s) -> Bools:
 
 
 def check_photo(name: str, rgb: Tensor, *, nan: bool = False) -> None:
-    """Refuse a photo of other numbers than uint8, or floats in [0, 1] or a little above, as of a rendering.
+    """Refuse a photo of other numbers than uint8, or floats in [0, 1] or a little outside, as of a rendering.
 
     Args:
         name: What the error calls it.
@@ -95,8 +95,11 @@ def check_photo(name: str, rgb: Tensor, *, nan: bool = False) -> None:
     Raises:
         ValueError: It has others.
     """
-    if rgb.dtype != torch.uint8 and not (rgb.is_floating_point() and (rgb.max() < 2 or (nan and rgb.isnan().any()))):
-        raise ValueError(f"{name} is {rgb.dtype} of up to {rgb.float().max():g}, not uint8 or float in [0, 1]")
+    if rgb.dtype == torch.uint8:
+        return
+    low, high = rgb.float().aminmax()
+    if not (rgb.is_floating_point() and (-0.5 < low <= high < 2 or (nan and rgb.isnan().any()))):
+        raise ValueError(f"{name} is {rgb.dtype} of up to {high:g}, from {low:g}, not uint8 or float in [0, 1]")
 
 
 @dataclass(frozen=True, eq=False)

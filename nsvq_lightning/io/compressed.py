@@ -140,6 +140,9 @@ class CompressedScene:
         }
         if missing := set(splat.ATTRIBUTES) - {"shN"} - rows.keys():
             raise ValueError(f"the splats have no {', '.join(sorted(missing))}")
+        logits = rows["opacities"]
+        if logits.size and 0 <= logits.min() < logits.max() <= 1:
+            log.warning("all opacities are in [0, 1]: logits are expected, and logarithms of scales")
         return cls.from_rows(rows, **header)
 
     @classmethod

@@ -142,8 +142,9 @@ class Splats(nn.Module):
         n = len(points)
         if n == 0:
             raise ValueError("the point cloud has no finite point; reconstruct the scene again or start from a .ply")
-        if colors.max() > 1:
-            raise ValueError(f"colours of points are up to {colors.max():g}, not in [0, 1]: divide bytes by 255")
+        odd = colors.max() if colors.min() >= 0 else colors.min()
+        if not 0 <= odd <= 1:
+            raise ValueError(f"colours of points are up to {odd:g}, not in [0, 1]: divide bytes by 255")
         spread = _mean_squared_neighbour_distance(points).clamp(1e-7, 4.0)
         return cls.from_tensors(
             means=points,

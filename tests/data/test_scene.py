@@ -821,4 +821,6 @@ def test_photos_of_other_numbers_are_refused(kind: torch.dtype) -> None:
     camera = Camera(torch.eye(3), torch.eye(4), 8, 8)
     with pytest.raises(ValueError, match=rf"the photo a.png is {kind} of up to 2\d\d.*, not uint8 or float in"):
         View("a.png", 0, camera, photo.to(kind))
+    with pytest.raises(ValueError, match=r"float32 of up to \S+, from -0.9\d+, not uint8 or float in"):
+        View("a.png", 0, camera, photo / 127.5 - 1)
     assert View("a.png", 0, camera, photo / 255).to("cpu").image.dtype == torch.float32

@@ -53,6 +53,14 @@ def test_cameras_of_some_scenes_are_not_those_of_all(caplog: pytest.LogCaptureFi
     assert "of some scenes the cameras of their training are known, of some not" in caplog.text
 
 
+def test_activations_instead_of_logits_are_told(caplog: pytest.LogCaptureFixture) -> None:
+    rows = plain_scene(20, 1).tensors()._asdict()
+    CompressedScene.from_splats(rows)
+    assert not caplog.text
+    CompressedScene.from_splats(rows | {"opacities": rows["opacities"].sigmoid()})
+    assert "all opacities are in [0, 1]: logits are expected" in caplog.text
+
+
 def test_the_coarse_steps_of_one_scene_are_not_those_of_another() -> None:
     coarse, fine = (replace(plain_scene(5, 1), config={"precision": {"position": step}}) for step in (0.1, 0.01))
     assert CompressedScene.joined([coarse, coarse]).config == coarse.config

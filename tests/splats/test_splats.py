@@ -119,6 +119,8 @@ def test_first_splats_are_as_large_as_their_distance_says() -> None:
     assert other.opacities.sigmoid().tolist() == pytest.approx([0.3] * 8)
     with pytest.raises(ValueError, match=r"colours of points are up to 255, not in \[0, 1\]: divide bytes by 255"):
         Splats.from_points(points, torch.full_like(points, 255, dtype=torch.uint8))
+    with pytest.raises(ValueError, match="colours of points are up to -1, not in"):
+        Splats.from_points(points, torch.full_like(points, -1))
 
 
 def test_splats_of_arrays_are_those_of_tensors() -> None:
