@@ -118,7 +118,7 @@ def own_scene(
         _, reach = middle_of(splats.means.numpy())
         frame = Frame((reach or 1.0) / EXTENT)
     return Scene(
-        root=Path(split),
+        root=Path("memory"),
         names=tuple(f"{number:03d}" for number in range(len(cameras))),
         cameras=tuple(cameras),
         images=ImageStore((), held=[Picture(photo, None) for photo in seen]),
