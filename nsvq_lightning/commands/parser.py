@@ -88,7 +88,7 @@ def in_plain_words(message: str, arguments: Iterable[str]) -> str:
         arguments: Options with their values, to find the whole option among.
     """
     key = re.match(r'Parser key "([^"]+)":', message)
-    value = re.search(r"(?:Given|Got) value: (.*)\Z", message, re.S) or re.search(r"path string: (.*)", message)
+    value = re.search(r".*(?:Given|Got) value: (.*)\Z", message, re.S) or re.search(r"path string: (.*)", message)
     if key is None or value is None:
         return message
     name = key[1]
