@@ -120,7 +120,7 @@ def _cameras(options: Namespace, file: Path) -> "dict[str, Camera]":
     if scene is None:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
     sys.stderr.write("no photos: cameras are guessed from the scene (-y is up); --data.root names their folder\n")
-    return {f"guess {index}": camera for index, camera in enumerate(likely_cameras(scene.decode(), 12), 1)}
+    return {f"guess {index}": camera for index, camera in enumerate(likely_cameras(scene.decode(), 8), 1)}
 
 
 class _Server(ThreadingHTTPServer):
