@@ -273,6 +273,7 @@ class SplatModule(LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """One Adam optimiser with a named group for each attribute and codebook; first splats, if there are none."""
+        own = self.init_from is None and (len(self.splats) == 0 or self.trainer.ckpt_path is not None)
         if len(self.splats) == 0:
             degree = self.splats.sh_degree
             if self.init_from is None:
@@ -282,7 +283,7 @@ class SplatModule(LightningModule):
                 make = partial(run_scene.splats_of_file, self.init_from, self.scene)
                 self.active_sh_degree = degree
             self.splats = distributed.on_first_process(self.trainer, make).to(self.device)
-        run_scene.warn_of_others(self.trainer, self.splats.means)
+        run_scene.warn_of_others(self.trainer, self.splats.means, own)
         optimizer = optim.build_adam(optim.param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
         if self.rates.by_distance:
             run_scene.move_by_distance(self.trainer, optimizer, self.splats, self.extent)

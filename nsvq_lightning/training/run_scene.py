@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
+import numpy as np
 import torch
 from lightning.pytorch import Trainer
 from scipy.spatial import cKDTree
@@ -142,7 +143,11 @@ def splats_of_file(path: str, trained: SplatScene) -> Splats:
     Raises:
         ValueError: They have another SH degree.
     """
-    scene = read_scene(path).relative_to(trained.frame.origin)
+    scene = read_scene(path)
+    middle = np.median(scene.means, axis=0)
+    # Most formats cannot say an origin: their positions are the world's, or relative to that of the run they are of.
+    if any(scene.origin) or np.linalg.norm(middle - trained.frame.origin) < np.linalg.norm(middle):
+        scene = scene.relative_to(trained.frame.origin)
     degree = scene.sh_degree
     if degree != trained.splats.sh_degree:
         raise ValueError(
@@ -155,10 +160,16 @@ def splats_of_file(path: str, trained: SplatScene) -> Splats:
     return Splats.from_tensors(*trained.frame.splats(scene.decode()))
 
 
-def warn_of_others(trainer: Trainer, means: Tensor) -> None:
-    """Warn where the trainer's photos do not show the splats ``[N, 3]`` that it starts from, in its frame."""
+def warn_of_others(trainer: Trainer, means: Tensor, own: bool) -> None:
+    """Warn where the trainer's photos do not show the splats ``[N, 3]`` that it starts from, in its frame.
+
+    Args:
+        trainer: The trainer.
+        means: Positions of the splats.
+        own: Whether they are of the scene's own points, of which some photos may show few.
+    """
     scene = scene_of(trainer)
-    if scene is None or not trainer.is_global_zero:
+    if scene is None or (own and not scene.cloud) or not trainer.is_global_zero:
         return
     try:
         check_cameras(scene.standard.train_cameras, means.numpy(force=True))

@@ -191,6 +191,9 @@ def test_a_run_can_start_from_a_file(demo_scene: Path, tmp_path: Path, caplog: p
     caplog.clear()
     fit(SplatModule(sh_degree=1, codebooks=None, splats=start), data, [PhaseSchedule()], 1)
     assert "do not fit" not in caplog.text
+    data.scene.points.mul_(30)
+    fit(SplatModule(sh_degree=1, codebooks=None), data, [PhaseSchedule()], 1)
+    assert "do not fit" not in caplog.text  # the scene's own, which some photos may show little of
     start.means.data.mul_(30)
     fit(SplatModule(sh_degree=1, codebooks=None, splats=start), data, [PhaseSchedule()], 1)
     assert f"do not fit the photos of {demo_scene}: its" in caplog.text
@@ -210,3 +213,16 @@ def test_a_start_that_was_trained_to_look_otherwise_is_told(
         fit(SplatModule(**settings, init_from=str(path)), data, [PhaseSchedule()], 1)
         told = f"{path} was trained with antialiased=True, this run has False: it looks different at first"
         assert (told in caplog.text) is not antialiased
+
+
+def test_a_file_without_an_origin_is_where_it_fits(tmp_path: Path) -> None:
+    start = Splats.from_tensors(*random_splats(30, sh_degree=1))
+    frame = Frame(origin=(4000.0, 0.0, -500.0))
+    here = SimpleNamespace(frame=frame, splats=start, antialiased=False, background="black")
+    world = replace(CompressedScene.from_splats(start), origin=frame.origin)
+    save(world, tmp_path / "own.ply")  # which says no origin
+    save(world, tmp_path / "own.nsvq")
+    save(world.relative_to((0, 0, 0)), tmp_path / "absolute.ply")
+    for name in ("own.ply", "own.nsvq", "absolute.ply"):
+        found = run_scene.splats_of_file(str(tmp_path / name), cast(Any, here))
+        torch.testing.assert_close(found.means.mean(0), start.means.mean(0), atol=1e-2, rtol=0)
