@@ -57,7 +57,10 @@ def reserve(trainer: Trainer, checkpoint: StrPath | None) -> None:
 
     Raises:
         FileExistsError: The folder holds another run.
+        ValueError: Processes would be copies of this one, which holds the folder.
     """
+    if getattr(trainer.strategy, "_start_method", "popen") != "popen":
+        raise ValueError("processes of a command are commands, too: use --trainer.strategy=view_parallel")
     folder = _given(trainer)
     if folder and trainer.is_global_zero and not is_fast_dev_run(trainer):
         take(folder, checkpoint)

@@ -185,3 +185,13 @@ def test_the_command_neither_overwrites_nor_loses_a_log(
     after = contents(folder)
     assert after["scene.nsvq"] != before["scene.nsvq"]
     assert after["metrics_1.csv"] == before["metrics.csv"]
+
+
+def test_the_command_refuses_processes_that_would_be_its_copies(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    given = ["--trainer.devices=2", "--trainer.accelerator=cpu", "--trainer.strategy=view_parallel_spawn"]
+    assert main(["fit", f"--data.root={demo_scene}", *given]) == 1
+    assert "use --trainer.strategy=view_parallel" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
