@@ -190,7 +190,7 @@ def check_config(path: str) -> dict[str, Any]:
     """Settings of a config, none where the name is not that of a file, which the parser reports.
 
     Raises:
-        ValueError: It is not text, not YAML, too large, or not a table of settings.
+        ValueError: It is not text, not YAML, too large, not a table of settings, or a section has none.
     """
     import yaml
 
@@ -209,4 +209,7 @@ def check_config(path: str) -> dict[str, Any]:
     if not isinstance(settings, dict):
         found = "nothing" if settings is None else type(settings).__name__
         raise ValueError(f"config {path} holds {found}: give settings by name, like 'trainer: {{max_steps: 1000}}'")
+    # The parser would take the run's callbacks away, or fail.
+    if empty := [name for name in ("callbacks", "data", "model", "trainer") if settings.get(name, "") is None]:
+        raise ValueError(f"config {path} has nothing below {empty[0]}: remove that line")
     return settings

@@ -97,6 +97,7 @@ def test_values_are_found_by_the_name_that_an_option_has_without_its_class() -> 
         (b"#" * 200_000, "has 200000 bytes"),
         (b"[" * 100_000, "is not YAML .*recursion"),
         (b"a: &a {b: *a}", "is not YAML .*Circular"),
+        (b"callbacks:\n#  selection: null\n", "has nothing below callbacks: remove that line"),
     ],
 )
 def test_what_cannot_be_a_config(tmp_path: Path, content: bytes, message: str) -> None:
