@@ -29,7 +29,7 @@ from warnings import catch_warnings
 import numpy as np
 
 from nsvq_lightning.commands import markdown_table, say
-from nsvq_lightning.commands.arguments import integers, names
+from nsvq_lightning.commands.arguments import integers, names, positive
 from nsvq_lightning.commands.settings import expand
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.version import __version__
@@ -59,7 +59,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add("--quantizers", **listed, metavar="A,B", help="classes, as for nsvq fit --model.quantizer")
     add("--codebooks", **listed, metavar="1k,4k", help="sizes, for configurations that have codebooks")
     add("--seeds", type=integers, default=("",), metavar="0,1,2", help="of the draws and of the order of the views")
-    add("--max-steps", type=int, metavar="N", help="iterations of every run (default: those of its configuration)")
+    add("--max-steps", type=positive(int), metavar="N", help="iterations of every run (default: its configuration's)")
     parser.add_argument("--keep-checkpoints", action="store_true", help="keep those of finished runs")
     help_ = "only print a command for each unfinished run, to be run anywhere"
     parser.add_argument("--commands", action="store_true", help=help_)
@@ -127,8 +127,8 @@ def plan(options: Namespace) -> list[Run]:
 
     Raises:
         SystemExit: A configuration or an option of ``nsvq fit`` is wrong; a line on stderr says how.
-        ValueError: A codebook size is unknown, a scene is no folder, two runs have the same names, or options give a
-            checkpoint to go on from, a seed of everything, or two sizes of the scene.
+        ValueError: A codebook size is unknown, a scene is no folder or not named, two runs have the same names, or
+            options give a checkpoint to go on from, a seed of everything, or two sizes of the scene.
     """
     import yaml
 
@@ -155,7 +155,10 @@ def plan(options: Namespace) -> list[Run]:
             quantizers = sizes = ("",)
         for scene, quantizer, size, seed in product(options.scenes, quantizers, sizes, options.seeds):
             # Absolute, so that the same sweep started from another folder finds its runs.
-            root = Path(scene or default["data"]["init_args"].get("root", "")).expanduser().resolve()
+            found = scene or default["data"]["init_args"].get("root", "")
+            if found is None:
+                raise ValueError("which scenes? Name their folders: --scenes=path/to/one,path/to/another")
+            root = Path(found).expanduser().resolve()
             start = default["model"]["init_from"]
             chosen = {
                 "data.root": root,

@@ -128,6 +128,10 @@ def test_what_cannot_be_is_said_at_once(scenes: tuple[str, str], tmp_path: Path)
     ):
         with pytest.raises(SystemExit):
             planned(fox, wrong)
+    with pytest.raises(ValueError, match="which scenes"):
+        planned("--codebooks=1k")
+    with pytest.raises(SystemExit):
+        planned(fox, "--max-steps=0")
     with pytest.raises(ValueError, match=r"ckpt_path=a\.ckpt"):
         planned(fox, "--ckpt_path=a.ckpt")
     with pytest.raises(ValueError, match=r"--seeds of its own; leave seed_everything=3 out"):
