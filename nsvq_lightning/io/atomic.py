@@ -72,8 +72,14 @@ def atomic_write(path: StrPath) -> Iterator[BinaryIO]:
 
 
 def make_folder_of(path: Path) -> None:
-    """Make the folder that a file is to be in, and those around it, where they are missing."""
+    """Make the folder that a file is to be in, and those around it, where they are missing.
+
+    Raises:
+        PermissionError: Nothing can be written there.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
+    if not os.access(path.parent, os.W_OK):
+        raise PermissionError(f"cannot write {path}: its folder is read-only")
 
 
 def write_bytes(path: StrPath, content: bytes) -> None:
