@@ -91,12 +91,14 @@ def check_pair(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Non
     """Refuse pictures that cannot be compared.
 
     Raises:
-        ValueError: They are not both ``[H, W, 3]``, the image is none of floats, or the mask is not ``[H, W]`` bool.
+        ValueError: They are not both ``[H, W, 3]``, the image is none of floats, the target none of floats or bytes,
+            or the mask is not ``[H, W]`` bool.
     """
     if image.shape != target.shape or image.dim() != 3 or image.shape[-1] != 3:
         raise ValueError(f"image and target must both be [H, W, 3], got {list(image.shape)} and {list(target.shape)}")
-    if not image.is_floating_point():
-        raise ValueError(f"the image must be of floats in [0, 1], got {image.dtype}; only the target may be of bytes")
+    if not (image.is_floating_point() and (target.is_floating_point() or target.dtype == torch.uint8)):
+        types = f"{image.dtype}; only the target may be of bytes, got {target.dtype}"
+        raise ValueError(f"the image must be of floats in [0, 1], got {types}")
     if mask is not None and (mask.shape, mask.dtype) != (image.shape[:2], torch.bool):
         raise ValueError(f"masks of {list(image.shape)} must be [H, W], got {list(mask.shape)}, and bool: {mask.dtype}")
 

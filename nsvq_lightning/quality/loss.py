@@ -20,7 +20,7 @@ from nsvq_lightning.quality.formulas import LEAST_ERROR, LOG_WEIGHT, check_pair,
 
 def apply_mask(image: Tensor, mask: Tensor | None) -> Tensor:
     """An image ``[H, W, 3]`` that is 0 where its mask ``[H, W]`` is; itself without a mask."""
-    return image if mask is None else image * mask[..., None]
+    return image if mask is None else image.where(mask[..., None], 0)
 
 
 def mean_of_kept(mean: Tensor, mask: Tensor | None) -> Tensor:

@@ -157,6 +157,9 @@ def test_a_mask_takes_pixels_out_of_loss_gradient_and_similarity(psnr: bool) -> 
         torch.testing.assert_close(
             photometric_loss(other, torch.where(mask[..., None], photo, 1 - photo), weight, mask, psnr=psnr), loss
         )
+    unknown = photo.where(mask[..., None], torch.nan)
+    losses = [photometric_loss(image, target, 0.2, mask, psnr=psnr) for target in (unknown, photo)]
+    assert torch.equal(*losses)
     same = torch.where(mask[..., None], photo, torch.rand_like(photo))
     assert float(ssim(same, photo, mask)) == pytest.approx(1, abs=1e-6)
     assert float(ssim(image, photo, mask)) < 0.99
@@ -167,6 +170,13 @@ def test_a_mask_takes_pixels_out_of_loss_gradient_and_similarity(psnr: bool) -> 
 def test_photos_of_another_precision_are_those_of_the_image() -> None:
     image, photo = pair(20, 20)
     torch.testing.assert_close(photometric_loss(image, photo.double()), photometric_loss(image, photo))
+
+
+@pytest.mark.parametrize("kind", [torch.int32, torch.uint16])
+def test_photos_of_other_integers_are_refused(kind: torch.dtype) -> None:
+    image, photo = pair(20, 20)
+    with pytest.raises(ValueError, match=rf"only the target may be of bytes, got {kind}"):
+        ssim(image, (255 * photo).to(kind))
 
 
 @pytest.mark.parametrize("kind", [torch.uint8, torch.float32])
