@@ -43,7 +43,8 @@ def unknown_option(message: str, options: Iterable[str]) -> str:
     found = re.search(r"unrecognized arguments: --([\w.-]+)|[Oo]ption '([\w.]+)'", message)
     if found is None:
         return ""
-    known = [option for option in options if option.startswith("--") and not option.endswith((".help", "+"))]
+    unwanted = (".help", "+", "model.splats")
+    known = [option for option in options if option.startswith("--") and not option.endswith(unwanted)]
     return nearest(f"--{found[1] or found[2]}", known)
 
 

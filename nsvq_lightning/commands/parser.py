@@ -40,8 +40,7 @@ class QuietParser(LightningArgumentParser):
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Write the message to stderr and exit with status 2."""
-        # Parsers of nested classes are made by jsonargparse and named after the script.
-        program = self.prog.replace(" [options]", "") if self.prog.startswith("nsvq") else "nsvq COMMAND"
+        program = f"nsvq {next(iter(self.arguments), 'COMMAND')}"
         if message.endswith("required: root"):
             message += " (--data.root=path/to/scene)"
         elif message.startswith('Parser key "data":') and Path(message.rpartition("Given value: ")[2]).is_dir():
