@@ -33,7 +33,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add("--frames", type=positive(int), default=150, metavar="N", help="frames of a video; %(default)s by default")
     help_ = "longer side of the photos in which features are looked for; %(default)s by default, fewer are faster"
     add("--max-size", type=positive(int), default=1600, metavar="PIXELS", help=help_)
-    add("--threads", type=int, default=-1, metavar="N", help="threads; one a core by default")
+    add("--threads", type=positive(int), default=-1, metavar="N", help="threads; one a core by default")
     add("--again", action="store_true", help="begin anew instead of continuing")
 
 
