@@ -172,7 +172,8 @@ def check_room(folder: Path) -> Findings:
     writable = os.access(folder, os.W_OK)
     text = f"{disk / 1e9:.1f} GB free in {folder.resolve()}{'' if writable else ', which is read-only'}"
     advice = "checkpoints of a run take about 1 GB; see --trainer.default_root_dir"
-    yield judged("disk", text, advice, when=disk < MIN_DISK or not writable)
+    found = judged("disk", text, advice, when=disk < MIN_DISK or not writable)
+    yield found if writable else found._replace(verdict="problem")
 
 
 def check_backends() -> Findings:

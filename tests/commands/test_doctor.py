@@ -115,6 +115,8 @@ def test_little_memory_and_disk_are_noted(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(doctor, "available_memory", lambda: 10**9)
     monkeypatch.setattr(doctor, "MIN_DISK", 1 << 70)
     assert [finding.verdict for finding in doctor.check_room(tmp_path)] == ["note", "note"]
+    monkeypatch.setattr(doctor.os, "access", lambda *_: False)
+    assert [finding.verdict for finding in doctor.check_room(tmp_path)] == ["note", "problem"]
 
 
 @pytest.mark.parametrize("factor", [1.01, float("nan")])
