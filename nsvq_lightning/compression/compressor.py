@@ -167,9 +167,9 @@ class Compressor:
         self._splats = self.scene.tensors()
         self._render = renderer(self.scene)
         self._known = self.photos.train_cameras if self.photos else self.cameras
-        self.cameras = spread(
-            self.cameras or self._known or viewpoints.square_views(self._splats, viewpoints.VIEWS), viewpoints.VIEWS
-        )
+        cameras = self.cameras or self._known or viewpoints.square_views(self._splats, viewpoints.VIEWS)
+        # Of a walk, few show each place. All pictures are held.
+        self.cameras = spread(cameras, min(max(viewpoints.VIEWS, len(cameras) // 4), 4 * viewpoints.VIEWS))
         self._is_own = self.photos is None or self.photos.split == viewpoints.OWN
         if not self._is_own and (likeness := self.quality(self._splats)) < MIN_PSNR:
             about = f"{self.data.scene.root} are not of this scene: it has {likeness:.1f} dB there"

@@ -82,14 +82,15 @@ def train_sensitivities(
         trained: Renders the splats.
         seed: Seed of the run.
         splats: Raw attributes.
-        most: Most views to render.
+        most: Most views to render, of more than four times as many photos a fourth.
 
     Raises:
         ValueError: The trainer has no data module with a scene.
     """
     need = "what shows of splats is seen in the train views"
     scene = needed_scene(trainer, need, "leave out the callbacks that ask (selection, rate_distortion)")
-    for index in spread(scene.train, most)[trainer.global_rank :: trainer.world_size]:
+    # Of a walk, few photos show each place: those of none would cost nothing.
+    for index in spread(scene.train, max(most, len(scene.train) // 4))[trainer.global_rank :: trainer.world_size]:
         view = scene.view(index).to(splats.means.device)
         signs = generator(seed, trainer.global_step, "signs", index)
         yield view, *sensitivity(splats, view.camera, trained.render, signs, view.mask)

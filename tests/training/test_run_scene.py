@@ -24,6 +24,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import save
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT, Frame
+from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import Splats
 from nsvq_lightning.training import run_scene
 from nsvq_lightning.training.module import SplatModule
@@ -213,6 +214,17 @@ def test_a_start_that_was_trained_to_look_otherwise_is_told(
         fit(SplatModule(**settings, init_from=str(path)), data, [PhaseSchedule()], 1)
         told = f"{path} was trained with antialiased=True, this run has False: it looks different at first"
         assert (told in caplog.text) is not antialiased
+
+
+def test_a_fourth_of_many_photos_is_asked_what_shows(demo_scene: Path) -> None:
+    scene = ColmapDataModule(str(demo_scene), factor=4).scene
+    data = SimpleNamespace(scene=replace(scene, train=4 * scene.train))
+    trainer: Any = SimpleNamespace(datamodule=data, global_rank=0, world_size=1, global_step=0)
+    trained: Any = SimpleNamespace(render=render)
+    splats = random_splats(20)
+    for most in (2, 14):
+        found = list(run_scene.train_sensitivities(trainer, trained, 0, splats, most))
+        assert len(found) == max(most, len(scene.train)) > 2
 
 
 def test_a_file_without_an_origin_is_where_it_fits(tmp_path: Path) -> None:
