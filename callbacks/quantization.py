@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nsvq_lightning.quality.loss import apply_mask
-from nsvq_lightning.quality.metrics import eight_bit
+from nsvq_lightning.quality.metrics import color_corrected, eight_bit
 from nsvq_lightning.quantize import attributes
 from nsvq_lightning.quantize.codebook import Quantizer, held_codes
 from nsvq_lightning.quantize.nearest import cheapest, code_rates
@@ -329,7 +329,9 @@ class RateDistortion(SplatCallback):
         shown = {name: torch.zeros_like(splats.opacities) for name, each in quantizers if hasattr(each, "hold")}
         error = torch.zeros((), dtype=torch.float64, device=module.device)
         for view, squares, image in run_scene.train_sensitivities(trainer, module.scene, module.seed, splats, VIEWS):
-            error += (apply_mask(image, view.mask) - eight_bit(view.image)).square().sum(dtype=torch.float64)
+            photo = eight_bit(view.image)
+            alike = color_corrected(image.clamp(0, 1), photo, view.mask)  # no code makes up for its exposure
+            error += (apply_mask(alike, view.mask) - photo).square().sum(dtype=torch.float64)
             for name, total in shown.items():
                 total += getattr(squares, name).flatten(1).mean(1)
         error = distributed.sum_over_processes(trainer, error)

@@ -6,11 +6,12 @@ import logging
 import math
 from itertools import pairwise
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
 from runs import paper_replacement
+from splat_scenes import ball, front_camera
 from torch import Tensor
 
 from nsvq_lightning.callbacks import (
@@ -24,10 +25,11 @@ from nsvq_lightning.callbacks import (
 )
 from nsvq_lightning.callbacks.base import keep_finite_splats
 from nsvq_lightning.callbacks.quantization import perplexity
+from nsvq_lightning.data.scene import View
 from nsvq_lightning.quantize import NSVQ, StraightThrough
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import RawSplats, Splats
-from nsvq_lightning.training import distributed
+from nsvq_lightning.training import distributed, run_scene
 from nsvq_lightning.training.optim import LearningRates, build_adam, param_groups
 from nsvq_lightning.training.row_ops import append_rows, keep_rows
 from nsvq_lightning.training.schedule import Phase, Schedule
@@ -65,6 +67,28 @@ def test_measurements_are_due_in_the_quantize_phase_alone(ends: dict[str, int]) 
     due = [i for i in range(1, schedule.total + 1) if RateDistortion().is_due(long, i)]
     assert all(schedule.phase_at(iteration) is Phase.QUANTIZE for iteration in due)
     assert len(due) == (0 if ends else 3)
+
+
+def test_a_bit_costs_what_splats_miss_and_no_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = torch.rand(2, 24, 32, 3, generator=generator(0, 0, "picture"))
+    image, photo = 0.2 + 0.6 * seen[0], 0.2 + 0.6 * (0.9 * seen[0] + 0.1 * seen[1])
+    splats = ball(9).tensors()
+    module = host(
+        scene=SimpleNamespace(hard_splats=lambda _: splats),
+        quantizers={"scales": StraightThrough(4, 3)},
+        splats=splats.means,
+        seed=0,
+        device="cpu",
+    )
+    prices = []
+    for shown in (photo, 0.6 * photo):
+        found = [(View("a", 0, front_camera(32, 24), shown), splats, image)]
+        monkeypatch.setattr(run_scene, "train_sensitivities", lambda *_, found=found: found)
+        rates = RateDistortion()
+        rates._measure(cast(Any, SimpleNamespace(world_size=1)), module)
+        prices.append(rates.prices["scales"])
+    # What splats miss of a darker photo is as much smaller.
+    torch.testing.assert_close(prices[1], 0.36 * prices[0], rtol=0.1, atol=0)
 
 
 @pytest.mark.parametrize(
