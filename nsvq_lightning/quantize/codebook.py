@@ -14,6 +14,11 @@ from nsvq_lightning.quantize.tracking import NearestTracker
 from nsvq_lightning.random import generator as seeded
 from nsvq_lightning.skips import is_on
 
+# Rows as they are rendered ``[V, D]``, and their codes ``[V]``.
+Quantized = tuple[Tensor, Tensor]
+# What k-means starts from.
+Start = Literal["sample", "spread"]
+
 
 def copy_codes(active: Tensor, count: int, generator: Generator) -> Tensor:
     """New codes ``[count, D]`` by the paper's rule: random picks of the active codes ``[A, D]``, plus noise of 1e-12.
@@ -81,9 +86,7 @@ class CodebookQuantizer(nn.Module, ABC):
     held: Tensor
     fitted: Tensor
 
-    def __init__(
-        self, num_codes: int, dim: int, *, kmeans_steps: int = 10, start: Literal["sample", "spread"] = "sample"
-    ) -> None:
+    def __init__(self, num_codes: int, dim: int, *, kmeans_steps: int = 10, start: Start = "sample") -> None:
         super().__init__()
         for name, value, bound in (("num_codes", num_codes, 1), ("dim", dim, 1), ("kmeans_steps", kmeans_steps, 0)):
             if value < bound:
@@ -155,9 +158,7 @@ class CodebookQuantizer(nn.Module, ABC):
         self.max_codes = min(codes, self.max_codes)
         self._resize(min(codes, self.num_codes))
 
-    def forward(
-        self, x: Tensor, generator: Generator | None = None, rows: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, x: Tensor, generator: Generator | None = None, rows: Tensor | None = None) -> Quantized:
         """Quantize rows; in training this also counts the codes that are hit.
 
         Args:
@@ -343,9 +344,7 @@ class Quantizer(Protocol):
     def fit(self, x: Tensor, weight: Tensor | None = None, generator: Generator | None = None) -> None:
         """Place the codebook on the rows ``x [N, D]`` (k-means); ``K`` shrinks to the number of distinct rows."""
 
-    def forward(
-        self, x: Tensor, generator: Generator | None = None, rows: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, x: Tensor, generator: Generator | None = None, rows: Tensor | None = None) -> Quantized:
         """Quantize rows of ``x [N, D]`` in training: differentiable ``x_q [V, D]``, codes ``[V]``; counts the usage.
 
         A quantizer that leaves training alone returns the rows themselves, -1 as their codes, and counts nothing.

@@ -1,12 +1,12 @@
 """Quantizers for comparison: straight-through ones, and k-means after training."""
 
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Generator, Tensor
 
 from nsvq_lightning.compute.rows import take_rows
-from nsvq_lightning.quantize.codebook import CodebookQuantizer
+from nsvq_lightning.quantize.codebook import CodebookQuantizer, Quantized, Start
 from nsvq_lightning.quantize.kmeans import kmeans, lookup
 from nsvq_lightning.random import generator as seeded
 
@@ -39,9 +39,7 @@ class TrainedStraightThrough(CodebookQuantizer):
     fifty iterations, and training may end at any iteration.
     """
 
-    def __init__(
-        self, num_codes: int, dim: int, *, start: Literal["sample", "spread"] = "spread", **settings: Any
-    ) -> None:
+    def __init__(self, num_codes: int, dim: int, *, start: Start = "spread", **settings: Any) -> None:
         super().__init__(num_codes, dim, start=start, **settings)
 
     def approximate(self, x: Tensor, codes: Tensor, generator: Generator, rows: Tensor | None) -> Tensor:
@@ -65,9 +63,7 @@ class PostHoc(CodebookQuantizer):
     # Codes that rows hold would keep the codebook of that moment: there is no such method here.
     hold = property()
 
-    def forward(
-        self, x: Tensor, generator: Generator | None = None, rows: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, x: Tensor, generator: Generator | None = None, rows: Tensor | None = None) -> Quantized:
         """In training, the rows ``[V, D]`` themselves, and -1 as the code of each; otherwise hard codes."""
         if self.frozen or not self.training:
             return super().forward(x, generator, rows)
