@@ -39,6 +39,8 @@ DATABASE = "database.db"
 STAMPS = "photos.json"
 # Called with a step, how much of it is done, and how much there is.
 Report = Callable[[str, int, int], None]
+# What the heads of photos say, by their names.
+Heads = Mapping[str, ImageHead]
 # Names of files, by the reason why they are left out.
 LeftOut = dict[str, list[str]]
 JPEG_QUALITY = 95
@@ -99,7 +101,7 @@ RECORD = "prepare.json"
 
 def reconstruct(
     scene: Path,
-    photos: Mapping[str, ImageHead],
+    photos: Heads,
     report: Report,
     is_video: bool = False,
     max_size: int = 1600,
@@ -152,7 +154,7 @@ _NOTHING_IN_COMMON = (
 )
 
 
-def oddities(photos: Mapping[str, ImageHead]) -> Iterator[str]:
+def oddities(photos: Heads) -> Iterator[str]:
     """What is unusual about photos and makes it unlikely that their cameras are found.
 
     Args:
@@ -172,9 +174,7 @@ def oddities(photos: Mapping[str, ImageHead]) -> Iterator[str]:
 MIN_SHARED = 8
 
 
-def _extract(
-    scene: Path, photos: Mapping[str, ImageHead], report: Report, max_size: int, threads: int
-) -> dict[str, str]:
+def _extract(scene: Path, photos: Heads, report: Report, max_size: int, threads: int) -> dict[str, str]:
     """Find features in photos that have none yet; returns the stamp of each photo."""
     pycolmap = import_pycolmap()
     images = scene / "images"

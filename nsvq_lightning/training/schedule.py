@@ -11,6 +11,9 @@ from enum import IntEnum
 from functools import cached_property, lru_cache
 from itertools import pairwise
 
+# Iterations, ascending.
+Times = tuple[int, ...]
+
 
 class Phase(IntEnum):
     """Phase of a run (paper, section 4.1).
@@ -181,7 +184,7 @@ class Schedule:
         return max(reference, minimum / self.scale) if self.scale < 1 else reference
 
     @lru_cache  # noqa: B019  callbacks ask in every step
-    def times(self, start: float, last: float, every: int, minimum: int = 1) -> tuple[int, ...]:
+    def times(self, start: float, last: float, every: int, minimum: int = 1) -> Times:
         """The iterations ``start, start + every, …, last`` of the reference run as iterations of this run.
 
         Each is rounded separately: an interval rounded up would lose the last of them.
@@ -190,22 +193,20 @@ class Schedule:
         count = math.floor((last - start) / stride + 1e-9) + 1
         return tuple(dict.fromkeys(self.iteration(start + k * stride) for k in range(count)))
 
-    def density_times(self, start: int, last: int, every: int) -> tuple[int, ...]:
+    def density_times(self, start: int, last: int, every: int) -> Times:
         """Iterations at which splats are cloned, split and pruned."""
         return self.times(start, last, every, self.min_density_interval)
 
-    def reset_times(self, last: int, every: int) -> tuple[int, ...]:
+    def reset_times(self, last: int, every: int) -> Times:
         """Iterations at which opacities are reset: the multiples of the interval up to ``last``."""
         return self.times(self.stride(every, self.min_reset_interval), last, every, self.min_reset_interval)
 
-    def refit_times(self, every: int) -> tuple[int, ...]:
+    def refit_times(self, every: int) -> Times:
         """Iterations of the quantize phase at which codebooks are refitted."""
         first = self.prune_end + self.stride(every, self.min_replacement_interval)
         return self.times(first, self._quantized, every, self.min_replacement_interval)
 
-    def replacement_times(
-        self, start: int, early_end: int, early_every: int, end: int, late_every: int
-    ) -> tuple[int, ...]:
+    def replacement_times(self, start: int, early_end: int, early_every: int, end: int, late_every: int) -> Times:
         """Iterations of the quantize phase at which inactive codes are replaced.
 
         There is an early series from ``start`` to ``early_end``, and a late one to ``end``. No window, even the first,
