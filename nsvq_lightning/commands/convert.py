@@ -203,5 +203,4 @@ def _measure(source: Path, output: Path, root: Path | None) -> None:
     written = formats.read_scene(output)
     if formats.suffix_of(output) == ".glb":  # which may have its origin in its positions
         written = written.relative_to(original.origin)
-    error = measure.error(written.tensors())
-    say(f"  {written_error(measure, error, source.name)}")
+    say(f"  {written_error(measure, measure.error(written.tensors()), source.name)}")

@@ -241,10 +241,9 @@ class SplatCLI(LightningCLI):
 
     def after_fit(self) -> None:
         """Test the decoded file, and print a summary."""
-        if is_fast_dev_run(self.trainer) or self.trainer.interrupted:
-            return
-        self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
-        self.after_test()
+        if not (is_fast_dev_run(self.trainer) or self.trainer.interrupted):
+            self.trainer.test(self.model, datamodule=self.datamodule, verbose=False)
+            self.after_test()
 
     def after_test(self) -> None:
         """Print a summary."""

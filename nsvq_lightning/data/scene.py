@@ -392,11 +392,10 @@ def _image_sources(
     kinds = [(image.camera_id, head.size) for image, head in zip(model.images, heads, strict=True)]
     keep_maps = len(set(kinds)) <= MAX_CAMERAS_WITH_MAPS
     lenses, odd = {}, []
-    for kind in dict.fromkeys(kinds):
-        number, size = kind
+    for number, size in dict.fromkeys(kinds):
         full, undistortion = rectify(model.cameras[number], *size, keep_maps=keep_maps)
         odd += _odd_lens(number, full, size)
-        lenses[kind] = undistortion, _scaled(full, divisor, max_width)
+        lenses[number, size] = undistortion, _scaled(full, divisor, max_width)
     if odd:
         log.warning("%s%s", odd[0], f" ({len(odd) - 1} more are odd)" if odd[1:] else "")
     return [

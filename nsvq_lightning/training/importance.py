@@ -121,8 +121,7 @@ def likely_effects(splats: RawSplats, squares: Tensor) -> Tensor:
     size = (splats.scales.topk(2).values.sum(1) / 3).exp()
     typical = splats.opacities.sigmoid().square() * size
     typical *= (effects / typical)[effects > 0].median().nan_to_num(1.0)  # where nothing has an effect
-    counted = effects.fmax(MIN_EFFECT * typical)
-    return counted**TRUST * typical ** (1 - TRUST)
+    return effects.fmax(MIN_EFFECT * typical) ** TRUST * typical ** (1 - TRUST)
 
 
 def floaters(splats: SplatTensors, views: Callable[[], Iterable[View]], render: Renderer) -> Tensor:

@@ -66,8 +66,7 @@ class StepClock(Callback):
         if self.regions:
             self.kernels.append(self.regions.taken())
         timing.finish()
-        took = 1000 * (time.perf_counter() - self._since)
-        self.steps.append((module.phase, took))
+        self.steps.append((module.phase, 1000 * (time.perf_counter() - self._since)))
         if trainer.global_step == trainer.max_steps:
             self.psnr = _test_psnr(module)
             self.splats = len(module.splats)
