@@ -12,7 +12,7 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.data.images import edges_of
-from nsvq_lightning.data.scene import View, detailed_pixels
+from nsvq_lightning.data.scene import View, detailed_pixels, stretch
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.random import draw_rows, generator, top_rows
 from nsvq_lightning.rendering.rasterize import Render
@@ -78,10 +78,12 @@ class SplatBudget(SplatCallback):
             advice = "give a number of splats (--splats) or bytes (--bytes)"
             scene = run_scene.needed_scene(trainer, "a budget from the photos needs them", advice)
             detail = distributed.on_first_process(trainer, partial(detailed_pixels, scene))
-            budget = splats_for_photos(len(scene.train), detail, self.quality)
+            far = stretch(scene)
+            budget = splats_for_photos(len(scene.train), detail, far * self.quality)
             reason = (
                 f"quality {self.quality:g} times what {len(scene.train)} photos with {detail:,.0f} detailed pixels "
-                "each support; --quality changes it"
+                f"each support{f', {far:.1f} times as each shows little of the scene' if far > 1 else ''}; --quality "
+                "changes it"
             )
         module.splat_budget, module.first_points = budget, round(self.start * budget)
         log.info("budget: %d splats, %s", budget, reason)

@@ -347,12 +347,12 @@ def check_budget(scene: "Scene") -> Findings:
     from nsvq_lightning.callbacks.forecast import iteration_seconds
     from nsvq_lightning.callbacks.growth import splats_for_photos
     from nsvq_lightning.compute.devices import best_device
-    from nsvq_lightning.data.scene import detailed_pixels
+    from nsvq_lightning.data.scene import detailed_pixels, stretch
 
     fast = check_config(find_config("fast"))
     phases = PhaseSchedule(**fast["callbacks"]["phases"])
     wanted = SplatBudget(**fast["callbacks"]["budget"])
-    budget = splats_for_photos(len(scene.train), detailed_pixels(scene), wanted.quality)
+    budget = splats_for_photos(len(scene.train), detailed_pixels(scene), wanted.quality * stretch(scene))
     steps = phases.limited(fast["trainer"]["max_steps"], len(scene.train))
     parts = BudgetedGrowth().stretches(phases.schedule(steps), round(wanted.start * budget), budget)
     minutes = steps * iteration_seconds(scene, parts, best_device()) / 60

@@ -605,3 +605,12 @@ def detailed_pixels(scene: Scene) -> float:
     pictures = (scene.images[index] for index in spread(scene.train, _SAMPLE))
     counts = [np.count_nonzero(np.abs(high_pass(*picture, cv2.CV_16S)) > _DETAIL) for picture in pictures]
     return sum(counts) / len(counts)
+
+
+def stretch(scene: Scene) -> float:
+    """How much more there is to see than around one place, from 1 to 8: more along a walk.
+
+    It is 1 where the usual point is in the picture of an eighth of the train photos or more.
+    """
+    shares = seen_by(spread(scene.train_cameras, SOME_CAMERAS), scene.points.numpy()).mean(0)
+    return float(np.clip(0.125 / np.median(shares[shares > 0]), 1, 8)) if shares.any() else 1.0

@@ -28,7 +28,7 @@ from nsvq_lightning.data.images import ImageHead, Picture
 from nsvq_lightning.data.photo_files import photos_below
 from nsvq_lightning.data.points import RANDOM_POINTS, in_picture, projected
 from nsvq_lightning.data.reconstruct import reconstruct
-from nsvq_lightning.data.scene import View, is_elsewhere, load_cameras, load_scene, seen_by, spread, usable
+from nsvq_lightning.data.scene import View, is_elsewhere, load_cameras, load_scene, seen_by, spread, stretch, usable
 from nsvq_lightning.data.transforms import read_poses
 from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.rendering.camera import Camera
@@ -807,6 +807,19 @@ def test_photos_that_keep_their_shape_are_turned_where_others_are(make_scene: Sc
         with PIL.Image.open(root / f"images/00{number}.png") as photo:
             shown = np.asarray(PIL.ImageOps.exif_transpose(photo)).astype(int)
         assert np.abs(scene.view(number).image.numpy() - shown).max() < 25
+
+
+@pytest.mark.parametrize(("photos", "expected"), [(4, 1.0), (40, 5.0), (400, 8.0)])
+def test_a_walk_stretches_farther_than_what_all_photos_show(
+    make_scene: SceneFactory, monkeypatch: pytest.MonkeyPatch, photos: int, expected: float
+) -> None:
+    scene = load_scene(make_scene())
+    assert stretch(scene) == 1.0
+    shown = np.eye(photos, photos + 99, dtype=bool)  # one in each; the others in none
+    monkeypatch.setattr("nsvq_lightning.data.scene.seen_by", lambda *_: shown)
+    assert stretch(scene) == pytest.approx(expected)
+    monkeypatch.setattr("nsvq_lightning.data.scene.seen_by", lambda *_: shown[:, photos:])
+    assert stretch(scene) == 1.0
 
 
 def test_some_rows_are_spread_over_all() -> None:
