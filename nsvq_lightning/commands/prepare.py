@@ -50,7 +50,7 @@ def run(options: Namespace) -> int:
     from nsvq_lightning.commands.doctor import check_folder, shown
     from nsvq_lightning.data import reconstruct
     from nsvq_lightning.data.colmap import find_model
-    from nsvq_lightning.data.images import image_head
+    from nsvq_lightning.data.images import ON_ITS_SIDE, image_head
 
     source, scene = options.source, options.scene
     if not source.exists():
@@ -84,6 +84,8 @@ def run(options: Namespace) -> int:
     if find_model(source):
         remarks.append(f"{source} has cameras already: nsvq fit --data.root {shlex.quote(source.as_posix())} uses them")
     heads = {name: image_head(images / name) for name in names}
+    if in_place and max(head.orientation for head in heads.values()) >= ON_ITS_SIDE:
+        remarks.append("some photos are stored on their side, as the scene will be: give them from another folder")
     say(*remarks, *reconstruct.oddities(heads))
     before = {*reconstruct.stamps_in(scene), *reconstruct.stamps_in(scene / "sparse")}
     verdict = reconstruct.reconstruct(scene, heads, report, is_video, options.max_size, options.threads)
@@ -127,6 +129,8 @@ def _claim(options: Namespace, is_video: bool, in_place: bool) -> None:
         own = {"images"} if in_place else set()
         if scene.is_dir() and {each.name for each in scene.iterdir()} - own - {".DS_Store"}:
             raise ValueError(f"{scene} is not empty and was not made by this command: name a new folder")
+    elif not in_place and json.loads(path.read_bytes()).get("source") == str((scene / "images").resolve()):
+        raise ValueError(f"{scene / 'images'} holds photos themselves, no copies: name a new folder for the scene")
     elif options.again:
         reconstruct.remove_database(scene)
         # The model stays until there is another, and is of no photo as it is now.

@@ -80,13 +80,16 @@ def test_another_video_of_the_same_name_needs_a_new_beginning(
     assert "no frame can be read" in _fails(capsys, video, scene, "--again")
 
 
-def test_photos_may_lie_in_their_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_photos_may_lie_in_their_place(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = tmp_path / "scene"
     (scene / "images").mkdir(parents=True)
     _noise(scene / "images" / "a.png")
     before = (scene / "images" / "a.png").read_bytes()
     for more in ([], ["--again"]):
         assert "too few" in _fails(capsys, scene / "images", scene, *more)
+        assert (scene / "images" / "a.png").read_bytes() == before
+        _noise(photos / "a.png", 1)  # of another photo
+        assert "holds photos themselves, no copies" in _fails(capsys, photos, scene, *more)
         assert (scene / "images" / "a.png").read_bytes() == before
 
 
