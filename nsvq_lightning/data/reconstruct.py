@@ -374,10 +374,10 @@ def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
         inside = path.relative_to(folder)
         if any((folder / parent / RECORD).is_file() for parent in inside.parents[:-1]):
             continue  # a scene, made of photos that are here
-        if path.parent != files[0].parent == folder:
-            reason = "in a folder beside the photos: give it alone, or put all photos into folders"
-        elif path in other:
+        if path in other:
             reason = "no photos by their names, or that of their folder"
+        elif path.parent != files[0].parent == folder:
+            reason = "in a folder beside the photos: give it alone, or put all photos into folders"
         elif taken.setdefault(str(inside.with_suffix("")).casefold(), path) != path:
             reason = "another file of that name is taken"
         else:
