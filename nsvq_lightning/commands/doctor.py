@@ -1,6 +1,6 @@
 """Check whether this machine is fit for training, and whether a COLMAP folder is a good scene.
 
-Each line is good, a note (works, could be better or faster) or a problem (a run would fail).
+Each line is good, a note (works, could be better or faster) or a problem (a run would fail, or miss something).
 
 Examples:
   nsvq doctor
