@@ -125,20 +125,19 @@ def _claim(options: Namespace, is_video: bool, in_place: bool) -> None:
     if is_video:
         record["frames"] = [options.frames, options.source.stat().st_size]
     path = scene / reconstruct.RECORD
-    if not path.is_file():
+    found = json.loads(path.read_bytes()) if path.is_file() else None
+    if found is None:
         own = {"images"} if in_place else set()
         if scene.is_dir() and {each.name for each in scene.iterdir()} - own - {".DS_Store"}:
             raise ValueError(f"{scene} is not empty and was not made by this command: name a new folder")
-    elif not in_place and json.loads(path.read_bytes()).get("source") == str((scene / "images").resolve()):
+    elif not in_place and found.get("source") == str((scene / "images").resolve()):
         raise ValueError(f"{scene / 'images'} holds photos themselves, no copies: name a new folder for the scene")
     elif options.again:
         reconstruct.remove_database(scene)
         # The model stays until there is another, and is of no photo as it is now.
         if outdated := dict.fromkeys(reconstruct.stamps_in(scene / "sparse"), ""):
             write_text(scene / "sparse" / reconstruct.STAMPS, json.dumps(outdated))
-    else:
-        found = json.loads(path.read_bytes())
-        if found != record:
-            raise ValueError(f"{scene} was prepared from {found.get('source')} or otherwise: --again begins anew")
+    elif found != record:
+        raise ValueError(f"{scene} was prepared from {found.get('source')} or otherwise: --again begins anew")
     (scene / "images").mkdir(parents=True, exist_ok=True)
     write_text(path, f"{json.dumps(record, indent=2)}\n")
