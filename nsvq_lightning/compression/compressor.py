@@ -172,8 +172,9 @@ class Compressor:
         self.cameras = spread(cameras, min(max(viewpoints.VIEWS, len(cameras) // 4), 4 * viewpoints.VIEWS))
         self._is_own = self.photos is None or self.photos.split == viewpoints.OWN
         if not self._is_own and (likeness := self.quality(self._splats)) < MIN_PSNR:
-            about = f"{self.data.scene.root} are not of this scene: it has {likeness:.1f} dB there"
-            raise ValueError(f"photos of {about}; are they RGB?")
+            raise ValueError(
+                f"photos of {self.data.scene.root} are not of this scene: it has {likeness:.1f} dB there; are they RGB?"
+            )
         # Of settings that are not turned, which needs no training.
         self._trained = cache(self._train)
         self._weights = cache(self._row_weights)

@@ -82,7 +82,7 @@ def train_sensitivities(
         trained: Renders the splats.
         seed: Seed of the run.
         splats: Raw attributes.
-        most: Most views to render, of more than four times as many photos a fourth.
+        most: Most views to render, or a fourth of the train photos where that is more.
 
     Raises:
         ValueError: The trainer has no data module with a scene.
