@@ -18,7 +18,7 @@ from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 
-from .base import WritingCallback, first_time
+from .base import WritingCallback
 from .settings import Whole
 
 log = logging.getLogger(__name__)
@@ -157,11 +157,8 @@ class RunCheckpoint(WritingCallback, Checkpoint):
         self._training = True
         self._stop.hold(trainer)
 
-    def on_train_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, *args: Any) -> None:
+    def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Save when it is time; stop here if a signal came."""
-        iteration = trainer.global_step
-        if iteration == 0 or not first_time(self, "after", iteration):
-            return  # of the next iteration some micro-batches are done
         if iteration == trainer.max_steps:
             # The end of training may fail; it belongs to a checkpoint, too, and signals wait.
             self._save(trainer, module)
