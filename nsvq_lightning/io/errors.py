@@ -50,6 +50,12 @@ def wrong_start(suffix: str, data: bytes, magic: bytes) -> FormatError:
     return FormatError(f"{cut}not a {suffix} file: it does not start with {magic.decode('latin-1')!r}")
 
 
+def check_start(suffix: str, data: bytes, magic: bytes, least: int = 0) -> None:
+    """Refuse a file that does not start as its format does, or has fewer bytes than the ``least`` of all."""
+    if len(data) < least or not data.startswith(magic):
+        raise wrong_start(suffix, data, magic)
+
+
 # An object of JSON.
 Json = dict[str, Any]
 # What reading one raises that holds something else than it should.

@@ -15,7 +15,7 @@ import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import STRANGE, FormatError, Json, check_room, json_object, naming_file, wrong_start
+from nsvq_lightning.io.errors import STRANGE, FormatError, Json, check_room, check_start, json_object, naming_file
 from nsvq_lightning.io.numbers import finite_logs, logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, moved, rotated
 from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s, sh_coefficients, unit
@@ -143,8 +143,7 @@ _MAX_JSON = 1 << 26
 
 def _parsed(data: bytes) -> tuple[Json, memoryview]:
     """JSON and binary chunk."""
-    if len(data) < _HEAD.size or data[:4] != b"glTF":
-        raise wrong_start(".glb", data, b"glTF")
+    check_start(".glb", data, b"glTF", _HEAD.size)
     _, version, total, length, kind = _HEAD.unpack_from(data)
     end = _HEAD.size + length
     if version != 2 or max(total, end) > len(data) or kind != b"JSON" or length > _MAX_JSON:

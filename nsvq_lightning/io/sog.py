@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, Json, check_room, json_object, naming_file, wrong_start
+from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, Json, check_room, check_start, json_object, naming_file
 from nsvq_lightning.io.numbers import bytes_of, logits_of_bytes, opacity_of
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, Int64s, Integers, Uint8s, sh_coefficients
@@ -146,8 +146,7 @@ class _Archive:
 
     def __init__(self, data: bytes) -> None:
         self._size = len(data)
-        if not data.startswith(_ZIP):
-            raise wrong_start(".sog", data, _ZIP)
+        check_start(".sog", data, _ZIP)
         try:
             self._zip = ZipFile(BytesIO(data))
         except _BAD_ZIP as error:

@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, check_room, naming_file, wrong_start
+from nsvq_lightning.io.errors import FormatError, check_room, check_start, naming_file
 from nsvq_lightning.io.numbers import Clamped, bytes_of, logits_of_bytes
 from nsvq_lightning.io.placing import UP_AXES, rotated
 from nsvq_lightning.splats import conventions
@@ -223,8 +223,7 @@ def _with_axes(header: SpzHeader, extensions: bytes) -> SpzHeader:
 
 def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
     """Header and arrays of versions 1 to 3."""
-    if not data.startswith(_GZIP):
-        raise wrong_start(".spz", data, _GZIP)
+    check_start(".spz", data, _GZIP)
     gunzip = zlib.decompressobj(wbits=31)
     header = _parse(_inflate(gunzip, data, _HEADER.size), len(data))
     if header.version > 3:
@@ -251,8 +250,7 @@ def _inflate(gunzip: "zlib._Decompress", data: bytes, most: int) -> bytes:
 
 def _parse(start: bytes, file_bytes: int) -> SpzHeader:
     """Header of any version; refuses more splats than a file of that many bytes can hold."""
-    if len(start) < _HEADER.size or start[:4] != _MAGIC:
-        raise wrong_start(".spz", start, _MAGIC)
+    check_start(".spz", start, _MAGIC, _HEADER.size)
     _, version, count, sh_degree, fraction_bits, flags, _ = _HEADER.unpack(start)
     if not 1 <= version <= 4:
         raise FormatError(f"version {version} of the format; this release reads 1 to 4", "save it as version 3 or .ply")

@@ -11,7 +11,7 @@ import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
+from nsvq_lightning.io.errors import FormatError, check_start, naming_file
 from nsvq_lightning.io.numbers import logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, UP_AXES, rotated
 from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, sh_coefficients, unit
@@ -80,8 +80,7 @@ def read_usda(path: StrPath) -> CompressedScene:
     with naming_file(path):
         if data.startswith((b"PXR-USDC", b"PK")):
             raise FormatError("binary OpenUSD (.usdc or .usdz); only text is read", BINARY_REMEDY)
-        if not data.startswith(b"#usda"):
-            raise wrong_start(".usda", data, b"#usda")
+        check_start(".usda", data, b"#usda")
         # No comments, and no strings but a letter, as of an axis: both may say anything.
         text = _WORDS.sub(lambda found: found[0] * (len(found[0]) == 3), data.decode("utf-8", "replace"))
         about, *prims = re.split(r"\b(?:def|over|class)\s+", text)

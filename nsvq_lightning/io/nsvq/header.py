@@ -21,7 +21,7 @@ import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, Json, json_object, naming_file, wrong_start
+from nsvq_lightning.io.errors import FormatError, Json, check_start, json_object, naming_file
 from nsvq_lightning.rendering.sampling import MAX_CAMERAS
 from nsvq_lightning.splats.attributes import attribute_dims
 from nsvq_lightning.splats.conventions import Float64s, Place
@@ -262,8 +262,7 @@ def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
     Raises:
         FormatError: Not a ``.nsvq`` file, truncated, altered, or of another version.
     """
-    if not data.startswith(MAGIC):
-        raise wrong_start(".nsvq", data, MAGIC)
+    check_start(".nsvq", data, MAGIC)
     if len(data) < _PREFIX.size:
         raise FormatError(f"truncated: {len(data)} bytes, the prefix alone has {_PREFIX.size}")
     _, digest, version, json_bytes = _PREFIX.unpack_from(data)
