@@ -217,7 +217,7 @@ class BudgetedGrowth(Densification):
         Raises:
             ValueError: Neither the callback nor the module has a budget.
         """
-        budget = module.splat_budget if self.budget is None else self.budget
+        budget = self.budget or module.splat_budget
         if budget is None:
             raise ValueError(
                 "growth needs a budget: list SplatBudget before it (--callbacks.budget=SplatBudget), or set "

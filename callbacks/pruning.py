@@ -80,7 +80,7 @@ class SplatSelection(SplatCallback):
         Raises:
             ValueError: There are splats to be removed, and the trainer has no data module with a scene.
         """
-        budget, count = module.splat_budget if self.budget is None else self.budget, len(module.splats)
+        budget, count = self.budget or module.splat_budget, len(module.splats)
         if budget is None or count <= budget or not self.is_due(module, iteration):
             return
         splats = below_cap(module.splats.raw())
