@@ -102,7 +102,7 @@ def optional(path: Path) -> Iterator[Path]:
     try:
         yield path
     except OSError as error:
-        log.warning("%s cannot be written (%s); the run goes on without it", path, error.strerror or error)
+        log.warning(f"{path} cannot be written ({error.strerror or error}); the run goes on without it")
 
 
 def remove_temporaries(folder: Path, process: str) -> None:

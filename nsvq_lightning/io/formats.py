@@ -54,7 +54,7 @@ def load(path: StrPath) -> "Splats":
     scene = read_scene(path)
     if any((*scene.origin, *scene.background, scene.antialiased)):
         facts = f"origin {scene.origin}, background {scene.background}, antialiased {scene.antialiased}"
-        logger.warning("%s: its splats alone do not say %s: nsvq_lightning.io.read_scene does", path, facts)
+        logger.warning(f"{path}: its splats alone do not say {facts}: nsvq_lightning.io.read_scene does")
     return scene.decode()
 
 
@@ -65,7 +65,7 @@ def read_scene(path: StrPath) -> CompressedScene:
     with naming_file(path):
         kept = scene.finite()
     if unturned := len(kept) - np.count_nonzero(kept.rows("quats").any(axis=1)):
-        logger.warning("%s: %d of %d splats have the rotation 0 0 0 0: not turned", path, unturned, len(kept))
+        logger.warning(f"{path}: {unturned} of {len(kept)} splats have the rotation 0 0 0 0: not turned")
     return replace(kept, stored_bytes=scene.stored_bytes or path.stat().st_size)
 
 

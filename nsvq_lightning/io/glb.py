@@ -192,11 +192,11 @@ def _splats(document: Json, data: memoryview, primitive: Json) -> CompressedScen
     if about.get("colorSpace") == "lin_rec709_display":
         log.warning("colorSpace lin_rec709_display: colours are linear light and are shown as they are, too dark")
     if (kernel := about.get("kernel", KERNEL)) != KERNEL:
-        log.warning("splats of the kernel %s are shown as of %s", kernel, KERNEL)
+        log.warning(f"splats of the kernel {kernel} are shown as of {KERNEL}")
     given = primitive["attributes"]
     names = {f"{EXTENSION}:{name[1:]}": number for name, number in given.items() if name.startswith("_")} | given
     if len(names) > len(given):
-        log.warning("attributes have the names of a draft of %s, such as _ROTATION", EXTENSION)
+        log.warning(f"attributes have the names of a draft of {EXTENSION}, such as _ROTATION")
 
     def values(name: str) -> Arrays:
         if name not in names:

@@ -149,7 +149,7 @@ def _parsed(file: BinaryIO) -> PlyHeader:
                 antialiased = number == "1"
             case ["comment", "vertical", "axis:", "z"]:  # nerfstudio's
                 about = "z is up, and cameras of a transforms.json beside it may be in another frame"
-                log.info("%s: %s; to turn it: nsvq convert --up minus-y --up-from 0 0 1", file.name, about)
+                log.info(f"{file.name}: {about}; to turn it: nsvq convert --up minus-y --up-from 0 0 1")
     return replace(elements.pop("vertex"), antialiased=antialiased, others=elements)
 
 
@@ -313,7 +313,7 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
     known = {*needed, *_UNUSED, *_RGB, "alpha", "filter_3D"}
     if others := [name for name in header.properties if name not in known]:
         shown = " ".join(others[:5])
-        log.warning("%s: %d other properties are left out (%s): splats that move stand still", path, len(others), shown)
+        log.warning(f"{path}: {len(others)} other properties are left out ({shown}): splats that move stand still")
     # A third scale that is not there stays flat.
     rows = {name: np.full((header.count, dim), FLAT, np.float32) for name, dim in attribute_dims(sh_degree).items()}
     kind = np.float64 if header.dtype["x"].itemsize == 8 else np.float32  # of positions on a map
@@ -331,7 +331,7 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
     # Writers that store opacity as a byte make 0 and 255 infinite logits.
     rows["opacities"] = finite_logits(rows["opacities"])
     if "filter_3D" in header.properties:
-        log.info("%s: filter_3D, the widths of Mip-Splatting, become part of scales and opacities", path)
+        log.info(f"{path}: filter_3D, the widths of Mip-Splatting, become part of scales and opacities")
         widths = np.concatenate([*read_ply_columns(path, header, ["filter_3D"])])
         wider = np.log(np.hypot(np.exp(rows["scales"]), widths))
         kept = np.exp((rows["scales"] - wider).sum(1, keepdims=True))

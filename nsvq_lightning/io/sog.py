@@ -253,7 +253,7 @@ class _Archive:
             raise FormatError(f"damaged: the 'codebook' of {attribute} holds no numbers")
         from scipy.interpolate import make_interp_spline  # slow to import
 
-        log.warning("%d levels of %s are null: taken in line with those beside", len(levels) - len(known), attribute)
+        log.warning(f"{len(levels) - len(known)} levels of {attribute} are null: taken in line with those beside")
         return make_interp_spline(known, levels[known], k=1)(np.arange(len(levels)))  # type: ignore[no-any-return]
 
     def colors(self) -> tuple[Float32s, Float32s]:
@@ -280,7 +280,7 @@ class _Archive:
         if marked.sum() < 0.5 * self.count:
             raise FormatError("damaged: most rotations have no mark of 252 to 255")
         if not marked.all():
-            log.warning("%d of %d rotations have no mark of 252 to 255", np.sum(~marked), self.count)
+            log.warning(f"{np.sum(~marked)} of {self.count} rotations have no mark of 252 to 255")
         others = (texels[:, :3] / 127.5 - 1) / math.sqrt(2)
         quats = conventions.from_smallest_three((texels[:, 3] % 4).astype(np.intp), others)  # 252 is a multiple of 4
         quats[~marked] = np.nan

@@ -37,10 +37,10 @@ def write_splat(path: StrPath, scene: CompressedScene) -> int:
         Bytes of the file.
     """
     if scene.sh_degree:
-        logger.warning("%s: .splat files hold no spherical harmonics; colours no longer change with the view", path)
+        logger.warning(f"{path}: .splat files hold no spherical harmonics; colours no longer change with the view")
     if scene.antialiased:
         advice = "switch it on in the viewer, or small splats look too thick"
-        logger.warning("%s: the file cannot say that the scene was trained with anti-aliasing: %s", path, advice)
+        logger.warning(f"{path}: the file cannot say that the scene was trained with anti-aliasing: {advice}")
     clamped = Clamped()
     records = np.concatenate([_records(part, clamped) for part in scene.parts()])
     clamped.warn(path, len(scene))

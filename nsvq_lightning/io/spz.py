@@ -261,7 +261,7 @@ def _parse(start: bytes, file_bytes: int) -> SpzHeader:
     check_room("splats", count, file_bytes)
     header = SpzHeader(version, count, sh_degree, fraction_bits, flags)
     if strange := flags & ~(ANTIALIASED | _EXTENDED | (_LEVELS if header.sizes["tree"] else 0)):
-        logger.warning("unknown flags 0x%02x of .spz", strange)
+        logger.warning(f"unknown flags 0x{strange:02x} of .spz")
     return header
 
 
@@ -382,10 +382,10 @@ def read_spz(path: StrPath) -> CompressedScene:
     }
     if not header.system:
         advice = "If it is upside down: nsvq convert --up minus-y --up-from 0 1 0"
-        logger.info("%s: the file does not say where its axes point; taken as right, down, front. %s", path, advice)
+        logger.info(f"{path}: the file does not say where its axes point; taken as right, down, front. {advice}")
     degree = min(header.sh_degree, 3)
     if header.sh_degree > degree:
-        logger.warning("%s: of SH degree %d, degrees up to %d are read", path, header.sh_degree, degree)
+        logger.warning(f"{path}: of SH degree {header.sh_degree}, degrees up to {degree} are read")
     factor = 2 if arrays["tree"].size else 1  # a splat that stands for several may be above 1
     levels = np.minimum(arrays["opacities"].astype(np.uint16) * factor, 255).astype(np.uint8)
     system = header.system or _SYSTEMS.index(DEFAULT_AXES) + 1
@@ -406,7 +406,7 @@ def read_spz(path: StrPath) -> CompressedScene:
     )
     if arrays["tree"].size:
         scene = scene.take(np.flatnonzero(arrays["tree"].ravel()[: 2 * header.count].view("<u2") == 0))
-        logger.info("%s: levels of detail; the finest is read, %d of %d splats", path, len(scene), header.count)
+        logger.info(f"{path}: levels of detail; the finest is read, {len(scene)} of {header.count} splats")
     # Signs first, then the turn, as Niantic's library does it, which writes such files.
     return rotated(scene, UP_AXES["z"]) if system > 8 else scene
 

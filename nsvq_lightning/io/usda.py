@@ -88,12 +88,12 @@ def read_usda(path: StrPath) -> CompressedScene:
         if len(own) != 1:
             raise FormatError(f"{len(own)} prims of the kind {PRIM}, not one", "export it anew with one")
         if b"lin_rec709" in data:
-            log.warning("%s: colours are linear light and are shown as they are, too dark", path)
+            log.warning(f"{path}: colours are linear light and are shown as they are, too dark")
         if "xformOp:" in text:
             raise FormatError("it has transforms (xformOp), which are not read", "export it anew, flattened")
         prim = own[0]
         if ".timeSamples" in prim:
-            log.warning("%s changes with time: the first sample is read", path)
+            log.warning(f"{path} changes with time: the first sample is read")
         rows = {
             "means": _rows(prim, "positions", 3),
             "opacities": logits_of(_rows(prim, "opacities", 1)),
