@@ -216,7 +216,7 @@ def model_files(root: Path, chosen: str | None = None) -> dict[str, Path]:
         raise _no_model(root, folders, chosen)
     if len(others) > 1:
         raise SceneError(f"{root} has models in {', '.join(others)}: choose one, such as --data.model={others[0]}")
-    log.info("%s: the COLMAP model is the one in %s", root, others[0])
+    log.info(f"{root}: the COLMAP model is the one in {others[0]}")
     return model_files(root, f"./{others[0]}")
 
 
@@ -288,7 +288,7 @@ def _table(path: Path, read: Callable[[Path], _Rows]) -> _Rows:
         raise SceneError(f"{path}: {error}; {remedy}") from error
     found = len(rows.xyz) if isinstance(rows, tables.PointTable) else len(rows)
     if announced > found:
-        log.warning("%s announces %d rows but has %d: unless you removed some, %s", path, announced, found, remedy)
+        log.warning(f"{path} announces {announced} rows but has {found}: unless you removed some, {remedy}")
     return rows
 
 
@@ -317,7 +317,7 @@ def _viewmats(rows: Sequence[tables.ImageRow], path: Path) -> Float64s:
             )
     worst = np.abs(norms - 1).max()
     if worst > _ROUNDED:
-        log.warning("%s: quaternions are up to %.2g %% too long or short; they are normalised", path, 100 * worst)
+        log.warning(f"{path}: quaternions are up to {100 * worst:.2g} % too long or short; they are normalised")
     viewmats = np.tile(np.eye(4), (len(rows), 1, 1))
     viewmats[:, :3, :3] = Rotation.from_quat(quats, scalar_first=True).as_matrix()
     viewmats[:, :3, 3] = poses[:, 4:]
@@ -433,5 +433,5 @@ def _observations(rows: Sequence[tables.ImageRow], tracks: Sequence[Sequence[int
     sightings = np.array(pairs, np.int64).reshape(-1, 2)
     lost = sightings[:, 1] < 0
     if lost.any():
-        log.warning("left out %d sightings by images that the model does not have", lost.sum())
+        log.warning(f"left out {lost.sum()} sightings by images that the model does not have")
     return np.unique(sightings[~lost], axis=0)

@@ -70,7 +70,7 @@ def locate(
     paths |= {name: path for path, name in used.items()}
     if used:
         path, name = next(iter(used.items()))
-        log.info("%d of %d files have other names than in %s: %s is %s", len(used), len(paths), source, name, path)
+        log.info(f"{len(used)} of {len(paths)} files have other names than in {source}: {name} is {path}")
     return paths
 
 
@@ -157,7 +157,7 @@ def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]
             f"{name}_2, _4 and _8), or name COLMAP's folder of undistorted ones, such as {root / 'dense/0'}, as the "
             f"scene; they are in {others or 'no other folder up to two levels down'}"
         )
-    log.info("%s does not exist: photos are read from %s", root / name, found[0])
+    log.info(f"{root / name} does not exist: photos are read from {found[0]}")
     return found[0], factor or 1
 
 
@@ -196,20 +196,20 @@ def find_masks(
     shown = " and ".join(map(str, found or usual or places[:-1]))
     if len(found) == 1:
         if not usual:
-            log.info("masks are read from %s", shown)
+            log.info(f"masks are read from {shown}")
         (masks,) = found.values()
         first, second = (given, masks) if has_own else (masks, given)
         return [one or other for one, other in zip(first, second, strict=True)]
     if found:
-        log.warning("masks in %s are not used: choose a folder (--data.masks)", shown)
+        log.warning(f"masks in {shown} are not used: choose a folder (--data.masks)")
     elif shown and not has_own:
         name = Path(relative[0])
         png = name.with_suffix(".png")
-        log.warning("%s has no mask of any photo: that of %s would be %s.png or %s", shown, name, name, png)
+        log.warning(f"{shown} has no mask of any photo: that of {name} would be {name}.png or {png}")
     elif not places and not has_own:
-        log.warning("there is no folder %s: no photo has a mask", root / folders[-1])
+        log.warning(f"there is no folder {root / folders[-1]}: no photo has a mask")
     elif any(path.name.startswith("dynamic_mask_") for path in photos.glob("*")):
-        log.warning("dynamic_mask_* in %s are not used: white leaves out in them; put inverted ones in masks/", photos)
+        log.warning(f"dynamic_mask_* in {photos} are not used: white leaves out in them; put inverted ones in masks/")
     return given
 
 

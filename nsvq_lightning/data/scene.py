@@ -284,7 +284,7 @@ def load_scene(
     root = Path(root).expanduser()
     poses = read_poses(root, model, allow_outside=allow_outside)
     if model is None and poses.source == "COLMAP" and (larger := larger_models(root)):
-        log.warning("%s: %s", root, larger)
+        log.warning(f"{root}: {larger}")
     views = range(len(poses.images))
     test = tuple(views[::test_every])
     split = f"every {test_every}th by name"
@@ -319,7 +319,7 @@ def load_scene(
     cameras = tuple(_camera(image, source.pinhole, near) for image, source in zip(poses.images, sources, strict=True))
     grey = poses.colors.size > 0 and not np.ptp(poses.colors)
     if grey:
-        log.info("the points of %s have no colours: they start grey, behind those that photos show", root)
+        log.info(f"the points of {root} have no colours: they start grey, behind those that photos show")
         poses = replace(poses, colors=np.full_like(poses.colors, 128))
     centres = np.stack([image.centre for image in poses.images])
     finite = np.isfinite(poses.points).all(1)
@@ -331,8 +331,8 @@ def load_scene(
     # At a camera's centre a point has no direction; splats there are in no view, or cover that camera's whole view.
     usable[finite] &= distances > _AT_CAMERA * extent
     if not usable.all():
-        text = "left out %d of %d points: they are at the centre of a camera, or far from all others"
-        log.warning(text, len(usable) - usable.sum(), len(usable))
+        text = f"left out {np.sum(~usable)} of {len(usable)} points"
+        log.warning(f"{text}: they are at the centre of a camera, or far from all others")
     images = ImageStore(sources, cache_bytes)
     scene = Scene(
         root=root,
@@ -352,7 +352,7 @@ def load_scene(
     )
     if not len(scene.points):
         scene = scene.with_random_points()
-        log.info("%s has no points: %d random ones in what the cameras see take their place", root, len(scene.points))
+        log.info(f"{root} has no points: {len(scene.points)} random ones in what the cameras see take their place")
     return scene
 
 
@@ -386,9 +386,9 @@ def _image_sources(
         # The program followed EXIF, so it did where that changes no shape, too.
         heads = [head_for(*each, as_shown=True) for each in sized]
         turned = sum(head.orientation != 1 for head in heads)
-        log.info("%d of %d photos are turned by their EXIF orientation, as their cameras are", turned, len(heads))
+        log.info(f"{turned} of {len(heads)} photos are turned by their EXIF orientation, as their cameras are")
     if others := sum(not same_shape(head.size, size) for head, (_, size) in zip(heads, sized, strict=True)):
-        log.warning("%d of %d photos %s", others, len(heads), OTHER_SHAPE)
+        log.warning(f"{others} of {len(heads)} photos {OTHER_SHAPE}")
     kinds = [(image.camera_id, head.size) for image, head in zip(model.images, heads, strict=True)]
     keep_maps = len(set(kinds)) <= MAX_CAMERAS_WITH_MAPS
     lenses, odd = {}, []
@@ -397,7 +397,7 @@ def _image_sources(
         odd += _odd_lens(number, full, size)
         lenses[number, size] = undistortion, _scaled(full, divisor, max_width)
     if odd:
-        log.warning("%s%s", odd[0], f" ({len(odd) - 1} more are odd)" if odd[1:] else "")
+        log.warning(f"{odd[0]}{f' ({len(odd) - 1} more are odd)' if odd[1:] else ''}")
     return [
         ImageSource(path, head.size, *lenses[kind], head.orientation, mask, head.has_alpha, model.synthetic)
         for path, head, kind, mask in zip(paths, heads, kinds, masks, strict=True)
@@ -524,10 +524,10 @@ def usable(scene: Scene) -> Scene:
         train, test = (tuple(view for view in views if view not in wrong) for views in (scene.train, scene.test))
         if not train or not test:
             raise first
-        log.warning("left out %d of %d photos, first: %s", len(wrong), len(scene), first)
+        log.warning(f"left out {len(wrong)} of {len(scene)} photos, first: {first}")
         scene = replace(scene, train=train, test=test)
     if is_elsewhere(scene):
-        log.warning("the points of %s %s; random ones take their place", scene.root, ELSEWHERE)
+        log.warning(f"the points of {scene.root} {ELSEWHERE}; random ones take their place")
         return scene.with_random_points()
     return scene
 
@@ -547,11 +547,11 @@ def _framed(model: ColmapModel, root: Path, origin: Place) -> tuple[ColmapModel,
     lost = np.flatnonzero(astray(centres, _CAMERA_ASTRAY))
     if len(lost):
         first = model.images[lost[0]].name
-        log.warning("%d photos are far from all others, first %s: check its pose, or leave it out", len(lost), first)
+        log.warning(f"{len(lost)} photos are far from all others, first {first}: check its pose, or leave it out")
     distance = np.linalg.norm(frame.middle) / (EXTENT * frame.unit)
     if not any(origin) and distance >= _FARTHEST:
         origin = frame.middle
-        log.info("%s: positions are relative to %s, as 0 is %.0f extents away", root, origin, distance)
+        log.info(f"{root}: positions are relative to {origin}, as 0 is {distance:.0f} extents away")
     points = spread(model.points[np.isfinite(model.points).all(1)], SOME_SPLATS)
     nearest = np.quantile(cKDTree(centres).query(points)[0], 0.01) if len(points) else math.inf
     near = frame.near * float(np.clip(_NEAREST * nearest / frame.near, _LEAST_NEAR, 1))

@@ -59,7 +59,7 @@ def read_poses(
     cloud = cloud_in([colmap.model_files(root, model)["images"].parent, root]) if not len(poses.points) else None
     if cloud is None:
         return poses
-    log.info("%s has no points in its COLMAP model: those of %s take their place", root, cloud)
+    log.info(f"{root} has no points in its COLMAP model: those of {cloud} take their place")
     points, colors = read_points(cloud)
     return replace(poses, points=points, colors=colors, cloud=True)
 
@@ -89,9 +89,9 @@ def _with_colmap_points(poses: ColmapModel, root: Path) -> ColmapModel:
         found = colmap.read_model(root, chosen=models[0])
         moved = colmap.alignment(found, poses)
     except SceneError as error:
-        log.warning("the points of %s are not used: %s", root / models[0], error)
+        log.warning(f"the points of {root / models[0]} are not used: {error}")
         return poses
-    log.info("%s names no points: those of %s are used", root / poses.source, root / models[0])
+    log.info(f"{root / poses.source} names no points: those of {root / models[0]} are used")
     return replace(poses, points=transformed(found.points, moved), colors=found.colors)
 
 
@@ -240,7 +240,7 @@ def _read_transforms(files: list[Path], allow_outside: bool) -> ColmapModel:
         # BlenderNeRF leaves test photos to be rendered: none is there, and the nearest names are those of train photos.
         named = ((frame, frames.get(name, frame)) for name, frame in tests.items())
         if not any(own.photo.is_file() and own.path("file_path") == one.path("file_path") for own, one in named):
-            log.warning("%s: none of its photos is there, so it is not used", file)
+            log.warning(f"{file}: none of its photos is there, so it is not used")
             continue
         train, test = set(frames), set(tests)
         frames |= tests
@@ -250,7 +250,7 @@ def _read_transforms(files: list[Path], allow_outside: bool) -> ColmapModel:
     is_split = bool(train and test)
     names = sorted(train | test if is_split else frames)
     if len(names) < len(frames):
-        log.info("%s: %d of %d photos are not used, by its lists", files[0], len(frames) - len(names), len(frames))
+        log.info(f"{files[0]}: {len(frames) - len(names)} of {len(frames)} photos are not used, by its lists")
     tops = {PurePosixPath(name).parts[0] if "/" in name and not colmap.is_outside(name) else "." for name in names}
     folder = tops.pop() if len(tops) == 1 else "."
     numbers: dict[_Lens, int] = {}
@@ -323,7 +323,7 @@ def _listed(head: Mapping[str, Any], frames: Mapping[str, _Frame]) -> tuple[set[
         given = head.get(f"{part}_filenames")
         found = [names.get(_plain(str(name))) for name in given] if isinstance(given, list) else []
         if missing := found.count(None):
-            log.warning("%d of %d names in %s_filenames are of no photo in the file", missing, len(found), part)
+            log.warning(f"{missing} of {len(found)} names in {part}_filenames are of no photo in the file")
         return set(filter(None, found))
 
     return listed("train"), listed("test") or listed("val")
@@ -346,7 +346,7 @@ def _points(
         check_name(_plain(name), f"ply_file_path in {root}", allow_outside)
         path: Path | None = root / _plain(name)
     elif path := cloud_in([root]):
-        log.info("%s names no points: those of %s are used", root, path)
+        log.info(f"{root} names no points: those of {path} are used")
     if path is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     points, colors = read_points(path)
@@ -359,6 +359,6 @@ def _points(
         views.append(Camera(lens.calibration_matrix(), torch.from_numpy(image.viewmat), lens.width, lens.height))
     moved = transformed(points, applied)
     if share_seen(moved, views) > 1.5 * share_seen(points, views):
-        log.info("%s: the points are not in the frame of the cameras: applied_transform moves them there", path)
+        log.info(f"{path}: the points are not in the frame of the cameras: applied_transform moves them there")
         return moved, colors
     return points, colors
