@@ -89,7 +89,7 @@ class GracefulStop:
         if number not in self._pending:
             self._pending.append(number)
             more = "" if self._several else "; a second one stops at once, without a checkpoint"
-            log.warning("%s: stopping after this iteration%s", signal.Signals(number).name, more)
+            log.warning(f"{signal.Signals(number).name}: stopping after this iteration{more}")
         elif not self._several:
             self._pending.remove(number)
             self._handlers[number](number, frame)
@@ -183,7 +183,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
             return
         self._training = False
         if self.last_path:
-            log.warning("stopped; the last checkpoint is of iteration %d: %s", self._saved, self.last_path)
+            log.warning(f"stopped; the last checkpoint is of iteration {self._saved}: {self.last_path}")
         else:
             log.warning("stopped before the first checkpoint")
 

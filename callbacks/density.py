@@ -87,7 +87,7 @@ class Densification(SplatCallback, ABC):
             kept = draw_rows(weights, round(KEPT * limit), generator(module.seed, 0, "limit"))
             row_ops.keep_rows(module.splats, trainer.optimizers[0], kept)
             distributed.check_replicas(trainer, "the limit of splats")
-            log.info("drew %d of %d splats by what they contribute to the train views", len(module.splats), count)
+            log.info(f"drew {len(module.splats)} of {count} splats by what they contribute to the train views")
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, batch: View, *args: Any) -> None:
         """Ask for what the statistics need while they are needed."""
@@ -259,12 +259,12 @@ class DensityControl(Densification):
             added = self._grow(module, iteration)
             pruned = self._prune(module, huge=iteration > schedule.iteration(self.huge_after))
             distributed.check_replicas(trainer, "density control")
-            log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
+            log.debug(f"iteration {iteration}: +{added} -{pruned} splats, now {len(module.splats)}")
         elif due:
             pruned = self._prune(module, huge=False)
             distributed.check_replicas(trainer, "pruning")
             level = logging.INFO if pruned else logging.DEBUG
-            log.log(level, "iteration %d: pruned %d splats, %d remain", iteration, pruned, len(module.splats))
+            log.log(level, f"iteration {iteration}: pruned {pruned} splats, {len(module.splats)} remain")
         on_white = module.background == "white" and self.white_reset > 0
         first = on_white and iteration == schedule.iteration(self.white_reset)
         if growing and (first or iteration in schedule.reset_times(self.reset_last, self.reset_every)):

@@ -86,7 +86,7 @@ class SplatBudget(SplatCallback):
                 "changes it"
             )
         module.splat_budget, module.first_points = budget, round(self.start * budget)
-        log.info("budget: %d splats, %s", budget, reason)
+        log.info(f"budget: {budget} splats, {reason}")
 
 
 # Distance of a child from its parent's centre, in units of the parent's longest axis (Improved-GS, section 3.2).
@@ -274,7 +274,7 @@ class BudgetedGrowth(Densification):
         if any(self.is_due(module, later) for later in range(iteration + 1, last + 1)):
             pruned = self.prune(module, module.splats.opacities.sigmoid() < self.min_opacity)
         distributed.check_replicas(module.trainer, "growth")
-        log.debug("iteration %d: +%d -%d splats, now %d", iteration, added, pruned, len(module.splats))
+        log.debug(f"iteration {iteration}: +{added} -{pruned} splats, now {len(module.splats)}")
         self.idle = self.idle + 1 if added < IDLE * min(room, len(module.splats)) else 0
         if self.idle >= self.patience > 0:
             module.schedule = replace(schedule, saved=schedule.saved + last - iteration)

@@ -59,14 +59,14 @@ class ExportScene(WritingCallback):
         for suffix in self.formats:
             with optional(folder / f"scene.{suffix}") as path:
                 size = save(scene, path, module.storage) if suffix == "nsvq" else save(decoded, path)
-                log.info("wrote %s (%d bytes)", path, size)
+                log.info(f"wrote {path} ({size} bytes)")
         photos = scene_of(trainer)
         if "nsvq" in self.formats and photos is not None:
             cameras = dict(zip(photos.names, photos.cameras, strict=True))
             with optional(folder / "viewer.html") as page:
                 viewer.write_cameras(folder / CAMERAS, cameras)
                 size = viewer.write_viewer(page, folder / "scene.nsvq", cameras, photos.root.resolve().name)
-                log.info("wrote %s (%d bytes)", page, size)
+                log.info(f"wrote {page} ({size} bytes)")
 
 
 class RenderWriter(BasePredictionWriter):
@@ -100,7 +100,7 @@ class RenderWriter(BasePredictionWriter):
     def on_predict_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Say where the pictures are."""
         if not is_fast_dev_run(trainer):
-            log.info("rendered views are in %s", self._target)
+            log.info(f"rendered views are in {self._target}")
 
 
 # Iterations after which the callback sees whether somebody asks; it takes some microseconds.

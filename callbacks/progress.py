@@ -87,7 +87,7 @@ class SplatProgressBar(TQDMProgressBar):
                 sys.stdout.write(f"iteration {done} of {total} ({100 * done // total} %), {times}: {text}\n")
                 sys.stdout.flush()
             except OSError as error:  # nobody reads any more
-                log.warning("the progress cannot be shown any more (%s); the run goes on", error)
+                log.warning(f"the progress cannot be shown any more ({error}); the run goes on")
                 sys.stdout = StringIO()
             return
         bar = self.train_progress_bar

@@ -89,4 +89,4 @@ class SplatSelection(SplatCallback):
         effects = likely_effects(splats, distributed.sum_over_processes(trainer, squares))
         row_ops.keep_rows(module.splats, trainer.optimizers[0], top_rows(effects, budget))
         distributed.check_replicas(trainer, "the selection")
-        log.info("iteration %d: the selection leaves %d of %d splats", iteration, budget, count)
+        log.info(f"iteration {iteration}: the selection leaves {budget} of {count} splats")

@@ -60,7 +60,7 @@ class CanonicalCovariance(SplatCallback):
         new = canonical(splats.scales, splats.quats)
         row_ops.change_coordinates(splats, optimizer, "scales", new.scales, new.scale_maps)
         row_ops.change_coordinates(splats, optimizer, "quats", new.quats, new.quat_maps)
-        log.info("iteration %d: each covariance as one of its 48 pairs of scale and rotation", iteration)
+        log.info(f"iteration {iteration}: each covariance as one of its 48 pairs of scale and rotation")
 
 
 def perplexity(usage: Tensor) -> float:
@@ -119,7 +119,7 @@ class CodebookInit(SplatCallback):
             if trainer.world_size > 1:  # a fit may leave fewer codes, so counters and all other buffers must follow
                 distributed.follow_first(trainer.strategy, quantizer)  # type: ignore[arg-type]
         if sizes := ", ".join(f"{name} {len(q.codebook)}" for name, q in module.quantizers.items()):
-            log.info("iteration %d: codebooks for %d splats: %s", iteration, len(module.splats), sizes)
+            log.info(f"iteration {iteration}: codebooks for {len(module.splats)} splats: {sizes}")
 
 
 @dataclass(eq=False)
@@ -190,7 +190,7 @@ class CodebookReplacement(SplatCallback):
                 replaced = quantizer.replace_unused(draws, rows=module.scene.rows(name), jitter=self.jitter)
                 row_ops.reset_moments(trainer.optimizers[0], optim.codebook_group(name), replaced)
             values[f"codebook/{name}_replaced"] = len(replaced)
-            log.debug("iteration %d: replaced %d codes of %s", iteration, len(replaced), name)
+            log.debug(f"iteration {iteration}: replaced {len(replaced)} codes of {name}")
         distributed.check_replicas(trainer, "the replacement of codes")
         module.log_dict(values, batch_size=1)
 
@@ -258,7 +258,7 @@ class CodebookRefit(SplatCallback):
             if trainer.is_global_zero:
                 quantizer.refit(module.scene.rows(name), self.steps)
             quantizer.codebook.data = distributed.from_first_process(trainer, quantizer.codebook.data)
-            log.debug("iteration %d: refitted the codebook of %s", iteration, name)
+            log.debug(f"iteration {iteration}: refitted the codebook of {name}")
 
 
 def _refittable(module: SplatModule) -> dict[str, Any]:
@@ -379,7 +379,7 @@ class FiniteCodes(SplatCallback):
             quantizer.mend(broken, module.scene.rows(name), generator(module.seed, iteration, "mend", name))
             row_ops.reset_moments(trainer.optimizers[0], optim.codebook_group(name), broken)
             rows = ", ".join(map(str, broken[:5].tolist())) + ", …" * (len(broken) > 5)
-            log.warning("%s (rows %s); mended", found, rows)
+            log.warning(f"{found} (rows {rows}); mended")
 
 
 @dataclass(eq=False)

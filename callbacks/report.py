@@ -218,8 +218,8 @@ class MetricReport(WritingCallback):
             paths = [picture_file(trainer, folder / "renders", score["name"]) for score in scores]
             views = [score | {"picture": path.name} for score, path in zip(scores, paths, strict=True)]
             with optional(folder / page.NAME):
-                told = module.history, module.schedule, self._beside.seconds(), metrics, views
-                log.info("report: %s", page.write_page(folder, *told))
+                path = page.write_page(folder, module.history, module.schedule, self._beside.seconds(), metrics, views)
+                log.info(f"report: {path}")
             if self.pictures:
                 pictures.log_pictures(trainer.loggers, [path for path in paths if path.exists()], trainer.global_step)
         self._scene, self._lpips = None, None

@@ -114,7 +114,7 @@ class PhaseSchedule(SplatCallback):
             planned, left = end - iteration, round((60 * self.minutes - seconds) / pace)
             left = min(max(left, planned // 2), planned + module.schedule.part(4))
             self._steps = iteration + trainer.strategy.broadcast(left) + module.schedule.saved
-            log.info("iterations: %d, as they take %.0f ms each now", self._steps, 1000 * pace)
+            log.info(f"iterations: {self._steps}, as they take {1000 * pace:.0f} ms each now")
 
     def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Set the module's schedule.
@@ -126,7 +126,7 @@ class PhaseSchedule(SplatCallback):
         if self.minutes is not None:
             steps = iterations_within(self.minutes, trainer, module, self.schedule(self.reference_total or 1))
             self._set_max_steps(trainer, steps)
-            log.info("iterations: %d, about %g min of training; evaluations and test come on top", steps, self.minutes)
+            log.info(f"iterations: {steps}, about {self.minutes:g} min of training; evaluations and test come on top")
             if steps < MIN_ITERATIONS:
                 log.warning("that is few: smaller photos (--data.factor=2) or fewer splats (--quality=0.5) give more")
         elif self.iterations_per_photo is not None and self.total is None:

@@ -168,7 +168,7 @@ class ViewParallelStrategy(DDPStrategy):
         all_reduce(tally)
         failed, *wanted = tally.tolist()  # waits for the backward pass: what is reduced next depends on it
         if failed and self.is_global_zero:
-            log.warning("the loss of %d of %d processes is not finite, no update", int(failed), self.world_size)
+            log.warning(f"the loss of {int(failed)} of {self.world_size} processes is not finite, no update")
         for parameter, count in zip(parameters, wanted, strict=True):
             if failed or not count:
                 parameter.grad = None

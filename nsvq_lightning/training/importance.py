@@ -148,7 +148,7 @@ def floaters(splats: SplatTensors, views: Callable[[], Iterable[View]], render: 
         # Of splats in the same pixels, the worst goes first.
         threshold = max(least, 0.25 * min(threshold, float(gain.amax())))
         gone = (gain > threshold) | (curvature == 0)
-        log.info("round %d: %d of %d splats go", number + 1, int(gone.sum()), len(left))
+        log.info(f"round {number + 1}: {int(gone.sum())} of {len(left)} splats go")
         left = left[~gone]
         if threshold == least or len(left) == 0:
             break

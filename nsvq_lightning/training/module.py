@@ -456,7 +456,7 @@ class SplatModule(LightningModule):
             self.schedule = resume.continued_schedule(checkpoint, self.schedule)
             settings = {**self.hparams, **settings}
         if changed := resume.changes(checkpoint, self.schedule, settings):
-            log.warning("the checkpoint is of a run with other settings: pass %s to continue it as it was", changed)
+            log.warning(f"the checkpoint is of a run with other settings: pass {changed} to continue it as it was")
         resume.check_continuation(checkpoint, self.state_dict(), self.quantizer_settings)
 
 
@@ -470,5 +470,5 @@ def _is_finite(loss: AsyncScalar, view: str, step: int) -> bool:
     """Whether the loss of a view is finite; otherwise say so."""
     value = loss.read()
     if not math.isfinite(value):
-        log.warning("step %d: the loss of %s is %s, no update", step + 1, view, value)
+        log.warning(f"step {step + 1}: the loss of {view} is {value}, no update")
     return math.isfinite(value)

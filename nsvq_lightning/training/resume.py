@@ -227,7 +227,7 @@ def check_scene(checkpoint: Values, scene: Scene) -> None:
             "--data.root with the folder it was trained on, or --trainer.allow_other_scene=true if that is meant"
         )
     if stored["views"].keys() != own["views"].keys() or stored.get("read", own["read"]) != own["read"]:
-        log.warning("%s has other photos, sizes or test views than the run so far: it may have seen these", scene.root)
+        log.warning(f"{scene.root} has other photos, sizes or test views than the run so far: it may have seen these")
 
 
 class PlainCheckpointIO(TorchCheckpointIO):

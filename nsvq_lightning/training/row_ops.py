@@ -132,7 +132,7 @@ def drop_non_finite(splats: Splats, optimizer: Optimizer, step: int) -> Tensor:
             raise FloatingPointError(
                 f"step {step}: all {len(splats)} splats are non-finite ({listed(culprits)}); lower the learning rates"
             )
-        log.warning("step %d: %s", step, dropped(kept, culprits))
+        log.warning(f"step {step}: {dropped(kept, culprits)}")
     keep_rows(splats, optimizer, kept)
     return kept
 

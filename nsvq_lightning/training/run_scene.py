@@ -157,7 +157,7 @@ def splats_of_file(path: str, trained: SplatScene) -> Splats:
     for name in "antialiased", "background":
         was, now = scene.config.get(name), getattr(trained, name)
         if was not in (None, now):
-            log.warning("%s was trained with %s=%s, this run has %s: it looks different at first", path, name, was, now)
+            log.warning(f"{path} was trained with {name}={was}, this run has {now}: it looks different at first")
     return Splats.from_tensors(*trained.frame.splats(scene.decode()))
 
 
@@ -175,7 +175,7 @@ def warn_of_others(trainer: Trainer, means: Tensor, own: bool) -> None:
     try:
         check_cameras(scene.standard.train_cameras, means.numpy(force=True))
     except ValueError as error:
-        log.warning("the splats to start from do not fit the photos of %s: its %s", scene.root, error)
+        log.warning(f"the splats to start from do not fit the photos of {scene.root}: its {error}")
 
 
 def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int) -> Splats:
@@ -222,7 +222,7 @@ def _with_dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Ten
     start = time.perf_counter()
     points, colors = dense_points(scene, count - known, seed)
     trim()
-    log.info("dense start: %d points beside %d of SfM, %.1f s", len(points), known, time.perf_counter() - start)
+    log.info(f"dense start: {len(points)} points beside {known} of SfM, {time.perf_counter() - start:.1f} s")
     if len(points) == 0:
         log.warning("photos show nothing that could be followed: training starts from SfM's points, or random ones")
     order = slice(None, None, -1 if fills else 1)

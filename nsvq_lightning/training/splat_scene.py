@@ -94,7 +94,7 @@ class SplatScene:
             raise ValueError("there are no splats to store or to measure: pass the checkpoint of a run (--ckpt_path)")
         quantizers = self.quantizers if phase >= Phase.QUANTIZE else {}
         if self.quantizers and not quantizers:
-            log.warning("the %s phase has no codebooks yet: the scene is stored unquantized", phase.name.lower())
+            log.warning(f"the {phase.name.lower()} phase has no codebooks yet: the scene is stored unquantized")
         scene = to_compressed(self.splats.raw(), quantizers)  # PostHoc fits its codebooks only now
         told = {
             "version": __version__,

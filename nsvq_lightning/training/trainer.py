@@ -91,5 +91,5 @@ class SplatTrainer(Trainer):
         make_folder_of(path)
         scene = model.compressed()
         size = save(scene, path, model.storage)
-        log.info("wrote %s: %d splats, %d bytes", path, len(scene), size)
+        log.info(f"wrote {path}: {len(scene)} splats, {size} bytes")
         return path
