@@ -162,7 +162,7 @@ def _found_views(path: Path, root: Path | None, origin: "Place") -> "Views":
     except (KeyError, TypeError):  # a config of something else
         pass
     except ValueError as error:
-        log.warning("%s", error)
+        log.warning(f"{error}")
     folder = root
     if given := data.get("root"):
         folder = Path(given).expanduser()
@@ -175,13 +175,13 @@ def _found_views(path: Path, root: Path | None, origin: "Place") -> "Views":
         except SceneError as error:
             if root and not isinstance(error, NoPhotosError):
                 raise
-            log.info("%s has cameras, but not all photos: %s", folder, error)
+            log.info(f"{folder} has cameras, but not all photos: {error}")
             return load_cameras(folder, **how), None
         return dict(zip(scene.names, scene.cameras, strict=True)), scene
     for place in [folder] if folder else folders_beside(path):
         is_list = (place / CAMERAS).is_file()
         if is_list or has_poses(place):
-            log.info("%s: its cameras are taken from %s", path, place)
+            log.info(f"{path}: its cameras are taken from {place}")
             return read_cameras(place / CAMERAS) if is_list else load_cameras(place, origin=origin), None
     return {}, None
 
@@ -210,7 +210,7 @@ def known_views(path: Path, root: Path | None, scene: "CompressedScene | None" =
         if scene and cameras:
             check_cameras(list(cameras.values()), scene.means, None if root else scene.cameras)
     except ValueError as error:
-        log.warning("%s: the cameras of %s are not used: %s", path, root or "the folders beside it", error)
+        log.warning(f"{path}: the cameras of {root or 'the folders beside it'} are not used: {error}")
         return {}, None
     return cameras, photos
 
@@ -262,11 +262,11 @@ def scene_with_views(
     except (ValueError, OSError) as error:
         if root:
             raise
-        log.warning("%s: the cameras of its training cannot be read (%s)", path, error)
+        log.warning(f"{path}: the cameras of its training cannot be read ({error})")
     if cameras and not len(scene.cameras):
         trained = photos.train_cameras if photos else cameras
         said = f"those of {len(trained)} cameras, {trained[0].width} pixels wide, that it was trained by"
-        log.info("%s: blur and size are %s", path, said)
+        log.info(f"{path}: blur and size are {said}")
         scene = replace(scene, cameras=trained_by(trained))
     arguments = map(arguments_of, folders_beside(path))
     if (photos and photos.white) or any("white_background=True" in given for given in arguments):

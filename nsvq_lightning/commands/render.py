@@ -132,7 +132,7 @@ def _path(
     width, height = options.size or cameras[0].size
     if is_video and (width % 2 or height % 2):
         width, height = max(2, width - width % 2), max(2, height - height % 2)
-        log.info("videos have even sides: %dx%d", width, height)
+        log.info(f"videos have even sides: {width}x{height}")
     cameras = [reframed(camera, width, height) for camera in cameras]
     frames = options.frames or max(1, round((options.seconds or SECONDS) * fps))
     if kind == "orbit":

@@ -245,7 +245,7 @@ def commands(runs: Sequence[Run]) -> Iterator[str]:
             try:
                 yield shlex.join(["nsvq", *prepare(run)])
             except FileExistsError as error:
-                log.info("%s", error)
+                log.info(f"{error}")
 
 
 def run_subprocess(arguments: Sequence[str], log: Path) -> int:
@@ -276,7 +276,7 @@ def train(run: Run) -> str:
         Why the training has failed, in one line; nothing if it is done.
     """
     said = run.folder / "log.txt"
-    log.info("%s: see %s", run.folder.name, said)
+    log.info(f"{run.folder.name}: see {said}")
     try:
         status = run_subprocess(prepare(run), said)
     except OSError as error:  # of the disk, or another process trains there
@@ -311,7 +311,7 @@ def sweep(output: Path, runs: Sequence[Run], keep_checkpoints: bool = False) -> 
             failed[run.folder] = error
         elif not keep_checkpoints:  # they are larger than everything else
             rmtree(run.folder / CHECKPOINT.parent, ignore_errors=True)
-        log.info("[%d/%d] %s: %s", number, len(runs), run.folder.name, error or "finished")
+        log.info(f"[{number}/{len(runs)}] {run.folder.name}: {error or 'finished'}")
         known = [each for each in runs if each.is_finished or each.folder in failed]
         rows = [row_of(each, failed.get(each.folder, "")) for each in known]
         write_results(output, rows)

@@ -396,7 +396,7 @@ class Compressor:
         """
         found = []
         for number, rows in enumerate(np.array_split(spatial_order(self.scene.means), self.parts)):
-            log.info("part %d of %d", number + 1, self.parts)
+            log.info(f"part {number + 1} of {self.parts}")
             part = self.scene.take(rows)
             cameras = viewpoints.showing(self._known, part.means, viewpoints.VIEWS)
             own = Compressor(part, cameras, None, self.storage, self.seed, self.minutes * len(part) / 1e6, self.steps)

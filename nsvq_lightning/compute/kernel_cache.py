@@ -163,7 +163,7 @@ class KernelCache(FunctionCache):
         try:
             return super()._load_overload(sig, target_context) or self._locked(sig, target_context)
         except OSError as error:  # a folder that cannot be read, or knows no locks
-            log.debug("%s is not looked for on the disk: %s", self._name, error)
+            log.debug(f"{self._name} is not looked for on the disk: {error}")
             return None
 
     def _locked(self, sig: Any, target_context: Any) -> Any:
@@ -190,7 +190,7 @@ class KernelCache(FunctionCache):
             for outdated in sorted(folders, key=lambda path: path.stat().st_mtime)[:-MAX_FOLDERS]:
                 rmtree(outdated, ignore_errors=True)
         except OSError as error:  # a full disk, or another process removes folders, too
-            log.debug("%s is not kept: %s", self._name, error)
+            log.debug(f"{self._name} is not kept: {error}")
         finally:
             self.let_go()
 

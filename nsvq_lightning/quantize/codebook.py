@@ -228,7 +228,7 @@ class CodebookQuantizer(nn.Module, ABC):
         replaced = (inactive & finite).nonzero()[:, 0]
         active = self.codebook[~inactive & finite]
         if len(active) == 0 < len(replaced):
-            _log.warning("no code was active in %d iterations; the codebook is left as it is", int(self.window))
+            _log.warning(f"no code was active in {int(self.window)} iterations; the codebook is left as it is")
             replaced = replaced[:0]
         if len(replaced) > 0:
             if rows is None:

@@ -119,7 +119,7 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
     if width % 2 or height % 2:
         raise ValueError(f"{path}: width and height of a video must be even, got {width}x{height}")
     program = shutil.which("ffmpeg")
-    log.info("%s: %s", path, "H.264" if program else "VP9")
+    log.info(f"{path}: {'H.264' if program else 'VP9'}")
     # Both programs tell the container by the suffix, which the unfinished file does not have.
     with atomic_path(path) as unfinished, tempfile.TemporaryDirectory(dir=path.parent) as folder:
         file = Path(folder) / f"video{VIDEO}"
@@ -164,4 +164,4 @@ def frame_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
         names = (path / f"{index:05d}.png" for index in count())
         yield lambda picture: write_png(next(names), picture)
         if (older := next(names)).exists():
-            log.warning("%s, and what may follow, are frames of an earlier render", older)
+            log.warning(f"{older}, and what may follow, are frames of an earlier render")
