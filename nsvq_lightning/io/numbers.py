@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath
+from nsvq_lightning.io.errors import Bytes
 from nsvq_lightning.splats.conventions import Float32s, Float64s, Int32s, Uint8s
 
 # Logarithm that stands for that of an axis length of 0, which discs have: too thin to show, and not beyond any format's
@@ -87,6 +88,11 @@ class Clamped(Counter[str]):
         """Warn how many of ``count`` splats were clamped to the format's range."""
         if changed := ", ".join(f"{name} {splats}" for name, splats in self.items() if splats):
             logger.warning(f"{path}: out of the range of its format, clamped to it: {changed} (of {count} splats)")
+
+
+def float_rows(data: Bytes, rows: int, dim: int) -> Float32s:
+    """The table ``[rows, dim]`` of float32 that bytes of a file hold; -1 rows are all that there are."""
+    return np.frombuffer(data, "<f4").astype(np.float32).reshape(rows, dim)
 
 
 def power_below(value: float) -> float:

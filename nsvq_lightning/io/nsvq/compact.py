@@ -30,7 +30,7 @@ from nsvq_lightning.io.nsvq import entropy
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 from nsvq_lightning.io.nsvq.precision import MAX_OPACITY_LEVELS, Precision
 from nsvq_lightning.io.nsvq.rounding import SMALL, Stored, doublings_of, leaf_paths, position_grid, rounded
-from nsvq_lightning.io.numbers import logits_of
+from nsvq_lightning.io.numbers import float_rows, logits_of
 from nsvq_lightning.splats.attributes import QUANTIZABLE
 from nsvq_lightning.splats.conventions import Int32s, Int64s, Uint64s
 
@@ -106,7 +106,7 @@ def decode_compact(header: Header, streams: Mapping[str, Bytes]) -> CompressedSc
     if not math.isfinite(doublings):
         raise FormatError(f"damaged: the cells of the positions have {doublings} doublings, not a finite number")
     grid = morton.Grid(entries["means"].step, tuple(base))
-    far = np.frombuffer(streams["means.far"], "<f4").astype(np.float32).reshape(-1, 3)
+    far = float_rows(streams["means.far"], -1, 3)
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         two = header.version > 3
         early = {name: pool.submit(_decoded, entries[name], streams, _before(header.splats), two) for name in _EARLY}

@@ -11,8 +11,9 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import Bytes, FormatError, naming_file
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry, frame, unframe
 from nsvq_lightning.io.nsvq.precision import LEVELS, Precision, Storage
+from nsvq_lightning.io.numbers import float_rows
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, listed
-from nsvq_lightning.splats.conventions import Float32s, Integers, Uint32s
+from nsvq_lightning.splats.conventions import Integers, Uint32s
 
 # Attributes in file order.
 _ORDER = ("means", "opacities", *QUANTIZABLE)
@@ -175,18 +176,21 @@ def decode_paper(header: Header, streams: Mapping[str, Bytes]) -> CompressedScen
     Raises:
         FormatError: The tables do not belong to this level, or a code is not a row of its codebook.
     """
-    _check_tables(header)
+    # Compared with the tables this release would write, before anything is allocated from their sizes.
+    header.check_attributes(_ORDER, _possible)
+    if header.streams != _layout(header.splats, header.attributes):
+        raise FormatError("damaged: the stream table does not fit the attribute table and the number of splats")
     n = header.splats
     coded = [entry for entry in header.attributes if entry.storage == "codes"]
     packed = unpack_fields(streams["codes"], n, [entry.bits for entry in coded]) if coded else []
     raw = [entry for entry in header.attributes if entry.storage == "raw" and entry.name in QUANTIZABLE]
     try:
         return CompressedScene(
-            means=_floats(streams["means"], n, 3),
-            opacities=_floats(streams["opacities"], n, 1)[:, 0],
+            means=float_rows(streams["means"], n, 3),
+            opacities=float_rows(streams["opacities"], n, 1)[:, 0],
             codes={entry.name: codes for entry, codes in zip(coded, packed, strict=True)},
-            codebooks={each.name: _floats(streams[f"{each.name}.codebook"], each.codes, each.dim) for each in coded},
-            raw={entry.name: _floats(streams[entry.name], n, entry.dim) for entry in raw},
+            codebooks={each.name: float_rows(streams[f"{each.name}.codebook"], each.codes, each.dim) for each in coded},
+            raw={entry.name: float_rows(streams[entry.name], n, entry.dim) for entry in raw},
             **header.of_scene,
         )
     except ValueError as error:
@@ -204,18 +208,7 @@ def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> tuple[StreamEntry
     )
 
 
-def _check_tables(header: Header) -> None:
-    """Compare with the tables this release would write, before anything is allocated from their sizes."""
-    header.check_attributes(_ORDER, _possible)
-    if header.streams != _layout(header.splats, header.attributes):
-        raise FormatError("damaged: the stream table does not fit the attribute table and the number of splats")
-
-
 def _possible(entry: AttributeEntry) -> bool:
     raw = entry.storage == "raw" and entry.codes == 0
     coded = entry.name in QUANTIZABLE and entry.storage == "codes" and 1 <= entry.codes <= 1 << 32
     return entry.step == 0 and (raw or coded)
-
-
-def _floats(data: Bytes, rows: int, dim: int) -> Float32s:
-    return np.frombuffer(data, "<f4").astype(np.float32).reshape(rows, dim)
