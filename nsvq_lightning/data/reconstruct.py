@@ -10,14 +10,13 @@ import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from importlib import import_module
 from io import BytesIO
 from pathlib import Path
 from shutil import rmtree
 from statistics import median_high
 from threading import Event, Thread
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -46,8 +45,7 @@ LeftOut = dict[str, list[str]]
 JPEG_QUALITY = 95
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(NamedTuple):
     """What came out.
 
     Attributes:

@@ -1,7 +1,6 @@
 """Positions as integers on a grid, in Morton order, each only as fine as necessary."""
 
-from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -22,8 +21,7 @@ _NONE = 2.0**52
 _WINDOW = 16
 
 
-@dataclass(frozen=True)
-class Grid:
+class Grid(NamedTuple):
     """A cube with 2^21 cells per side, in which position ``x`` is in cell ``floor(x / step) - base``.
 
     A position in the middle of its cell stays there on every grid that gives its splat a cell of the same width.

@@ -2,10 +2,9 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import reduce
 from operator import and_
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -15,8 +14,7 @@ from nsvq_lightning.splats.conventions import sh_coefficients
 _Array = TypeVar("_Array", bound=Any)
 
 
-@dataclass(frozen=True)
-class Attribute:
+class Attribute(NamedTuple):
     """What the rooms above know of one raw attribute.
 
     Attributes:

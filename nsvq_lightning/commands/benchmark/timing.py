@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from llvmlite import binding
@@ -64,8 +65,7 @@ class Scope:
         return "1k" if self.quick else "16k"
 
 
-@dataclass(frozen=True)
-class Measurement:
+class Measurement(NamedTuple):
     """One row of a table.
 
     Attributes:
