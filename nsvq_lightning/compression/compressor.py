@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 from warnings import catch_warnings
 
 import numpy as np
@@ -41,8 +41,7 @@ from nsvq_lightning.training.trainer import SplatTrainer
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Setting:
+class Setting(NamedTuple):
     """How a scene is compressed.
 
     Attributes:
@@ -203,7 +202,7 @@ class Compressor:
 
     def at(self, setting: Setting) -> Candidate:
         """The scene at a setting."""
-        whole = replace(setting, on_basis=False, turn=0.0)
+        whole = setting._replace(on_basis=False, turn=0.0)
         scene = self._trained(whole)
         if setting.on_basis:
             exact, small = STEPS
@@ -242,7 +241,7 @@ class Compressor:
         fits = None
         if 8 * target >= ON_BASIS * splats:
             plain = Setting(splats, "none", self.scene.sh_degree > 0)
-            exact = self.at(replace(plain, on_basis=False))
+            exact = self.at(plain._replace(on_basis=False))
             fits = exact if len(exact.data) <= target else self._fitting(plain, target)
             if fits and (self.stopped or (fits is exact and self._is_own)):
                 return fits
@@ -272,7 +271,7 @@ class Compressor:
                 break
             found = self._fitting(setting, target)
             if not found and setting.more:
-                found = self._fitting(replace(setting, more=0), target)
+                found = self._fitting(setting._replace(more=0), target)
             if found and (best is None or self.error(found) < self.error(best)):
                 best = found
             # There may be more room than the largest codebooks take.
@@ -280,7 +279,7 @@ class Compressor:
                 break
             before = setting
             # What the estimate made of its bytes.
-            made = found or self.at(replace(setting, turn=1.0))
+            made = found or self.at(setting._replace(turn=1.0))
             asked *= (1 - SLACK / 2) * target / len(made.data)
         return best
 
@@ -324,15 +323,15 @@ class Compressor:
     ) -> Candidate | None:
         """The candidate nearest to the most exact one, or with ``small`` False to the smallest, that fits; or None."""
         good, bad = (1.0, 0.0) if small else (0.0, 1.0)
-        best = self.at(replace(setting, turn=bad))
+        best = self.at(setting._replace(turn=bad))
         if fits(best):
             return best
-        best = self.at(replace(setting, turn=good))
+        best = self.at(setting._replace(turn=good))
         if not fits(best):
             return None
         while abs(good - bad) > 0.02 and not is_close(len(best.data)):
             middle = (good + bad) / 2
-            candidate = self.at(replace(setting, turn=middle))
+            candidate = self.at(setting._replace(turn=middle))
             if fits(candidate):
                 best, good = candidate, middle
             else:
@@ -402,7 +401,7 @@ class Compressor:
             own = Compressor(part, cameras, None, self.storage, self.seed, self.minutes * len(part) / 1e6, self.steps)
             own.stopped = self.stopped
             left = max(1, setting.splats * len(part) // len(self.scene))
-            found.append(own._train(replace(setting, splats=left)))
+            found.append(own._train(setting._replace(splats=left)))
             self.stopped = own.stopped
             del own, part
             trim()
