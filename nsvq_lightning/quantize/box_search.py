@@ -18,16 +18,7 @@ import numpy as np
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
-from nsvq_lightning.compute.memory import (
-    FLOAT32,
-    INT32,
-    INT64,
-    Array,
-    aligned_empty,
-    check_array,
-    check_inside,
-    check_table,
-)
+from nsvq_lightning.compute.memory import INT32, INT64, Array, aligned_empty, check_array, check_inside, check_table
 from nsvq_lightning.compute.rows import count_outside
 
 # Factor on the bounds, far above the relative rounding error of a float32 distance.
@@ -342,7 +333,7 @@ def box_search(
     check_array("order", order, (num_codes,), INT32)
     check_array("rows", rows, (rows.size,), INT64)
     check_array("memory[0]", last, (remembered,), INT32)
-    check_array("memory[1]", anchors, (remembered, dim), FLOAT32)
+    check_array("memory[1]", anchors, (remembered, dim), x.dtype)
     check_array("memory[2]", clearance, (remembered,), np.dtype(np.float64))
     check_inside("order", order, num_codes)
     result = np.empty(len(rows), np.int64)
