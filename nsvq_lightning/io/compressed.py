@@ -343,16 +343,14 @@ class CompressedScene:
             changes: By attribute, what makes rows ``[.., D]`` others, each by itself; they are rounded to float32.
             fields: Fields of the scene that change, too.
         """
-        codebooks = dict(self.codebooks)
-        bases = dict(self.bases)
-        raw = dict(self.raw)
+        tables: dict[str, Any] = {kind: dict(getattr(self, kind)) for kind in ("codebooks", "bases", "raw")}
         for name, change in changes.items():
-            table = next(each for each in (codebooks, bases, raw) if name in each)
+            table = next(each for each in tables.values() if name in each)
             rows = table[name]
             table[name] = np.empty((len(rows), change(rows[:1]).shape[1]), np.float32)
             for part in slices(len(rows)):
                 table[name][part] = change(rows[part])
-        return replace(self, codebooks=codebooks, raw=raw, bases=bases, stored_bytes=None, **fields)
+        return replace(self, **tables, stored_bytes=None, **fields)
 
     def with_degree(self, degree: int) -> "CompressedScene":
         """The scene with spherical harmonics up to a degree, 0 to 3: higher ones are left out, missing ones are 0."""

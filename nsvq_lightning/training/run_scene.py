@@ -149,11 +149,9 @@ def splats_of_file(path: str, trained: SplatScene) -> Splats:
     # Most formats cannot say an origin: their positions are the world's, or relative to that of the run they are of.
     if any(scene.origin) or np.linalg.norm(middle - trained.frame.origin) < np.linalg.norm(middle):
         scene = scene.relative_to(trained.frame.origin)
-    degree = scene.sh_degree
-    if degree != trained.splats.sh_degree:
-        raise ValueError(
-            f"{path} has SH degree {degree}, the module {trained.splats.sh_degree}; set sh_degree={degree}"
-        )
+    degree, own = scene.sh_degree, trained.splats.sh_degree
+    if degree != own:
+        raise ValueError(f"{path} has SH degree {degree}, the module {own}; set sh_degree={degree}")
     for name in "antialiased", "background":
         was, now = scene.config.get(name), getattr(trained, name)
         if was not in (None, now):
