@@ -121,10 +121,10 @@ def resolve_backend(backend: str, like: Tensor) -> str:
     if backend == "auto":
         kernels = kernels_for(like)
         # Another dtype is meant for the oracle.
-        if kernels is None and like.dtype == torch.float32 and (problem := _obstacle("cuda", like)) is not None:
+        if kernels is None and like.dtype == torch.float32 and (problem := _obstacle("cuda", like)):
             _warn_of_plain_torch(like.device.type, problem)
         return kernels or "reference"
-    if backend != "reference" and (problem := _obstacle(backend, like)) is not None:
+    if backend != "reference" and (problem := _obstacle(backend, like)):
         raise ValueError(f"backend {backend!r} cannot be used: {problem}, or use backend='auto'")
     return backend
 

@@ -39,7 +39,7 @@ def source_digest(module: str) -> str:
     waiting = [module]
     while waiting:
         name = waiting.pop()
-        if name not in digests and (path := _file_of(name, module)) is not None:
+        if name not in digests and (path := _file_of(name, module)):
             digests[name], imports = _read(path)
             package = name if path.stem == "__init__" else name.rpartition(".")[0]
             for base, names, modules in imports:
