@@ -2,6 +2,7 @@
 
 import logging
 import math
+import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -71,8 +72,9 @@ def check_cameras(cameras: Sequence[Camera], means: Float32s, trained: Float64s 
         apart, _ = cKDTree([camera.packed_view[12:] for camera in cameras]).query(places)
         if np.median(apart) > MOVED * (np.ptp(places, axis=0).max() or 1):
             raise ValueError(f"{len(cameras)} cameras stand elsewhere than those that the scene was trained by")
-    seen = seen_by(spread(cameras, SOME_CAMERAS), means)
-    shown = min(seen.any(0).mean(), (seen.mean(1) > 1e-3).mean())
+    # Of a survey, each camera shows a place of its own.
+    shown = seen_by(cameras, spread(means, 2000)).any(0).mean()
+    shown = min(shown, seen_by(spread(cameras, SOME_CAMERAS), means).any(1).mean())
     if shown < MIN_SHOWN:
         others = "they are of another scene, or in other coordinates (x right, y down, z forward)"
         raise ValueError(f"{len(cameras)} cameras show {shown:.0%} of the scene's splats: {others}")
@@ -300,6 +302,12 @@ def load_scene(
             f"test views; at least 1 of each is needed: {advice}"
         )
     names = [image.name for image in poses.images]
+    last = [re.split(r"\D+", Path(name).stem)[-1] for name in names]
+    if poses.test is None and len({last[view] for view in test}) == 1 < len(test) and len(set(last)) > 1:
+        log.warning(
+            f"all {len(test)} test photos end in {last[test[0]]}, as those of one camera of a rig: what it shows is "
+            f"not trained on; --data.test_every={test_every + 1} takes turns"
+        )
     if images_folder == "images":
         images_folder = poses.images_folder or images_folder
     folder, divisor = photo_folder(root, images_folder, factor, names)
@@ -610,7 +618,11 @@ def detailed_pixels(scene: Scene) -> float:
 def stretch(scene: Scene) -> float:
     """How much more there is to see than around one place, from 1 to 8: more along a walk.
 
-    It is 1 where the usual point is in the picture of an eighth of the train photos or more.
+    It is 1 where a fifth of the train photos or more show the usual point.
     """
-    shares = seen_by(spread(scene.train_cameras, SOME_CAMERAS), scene.points.numpy()).mean(0)
-    return float(np.clip(0.125 / np.median(shares[shares > 0]), 1, 8)) if shares.any() else 1.0
+    cameras, places = spread(scene.train_cameras, SOME_CAMERAS), spread(scene.points, SOME_SPLATS).double()
+    apart = torch.cdist(torch.tensor([camera.packed_view[12:] for camera in cameras], dtype=torch.float64), places)
+    apart[~torch.from_numpy(seen_by(cameras, places.numpy()))] = math.inf
+    # What is more than twice as far away as in the nearest photo, as behind a wall, is not shown.
+    shares = (apart < 2 * apart.amin(0)).numpy().mean(0)
+    return float(np.clip(0.2 / np.median(shares[shares > 0]), 1, 8)) if shares.any() else 1.0

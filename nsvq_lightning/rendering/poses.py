@@ -10,8 +10,9 @@ from torch import Tensor
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.splats.conventions import Float64s
 
-# Weight of what decides where cameras that all look the same way leave a direction open.
-LITTLE = 1e-5
+# Weight of what decides where cameras that all look the same way leave a direction open: which way is up, and how far
+# away they look, as those of a drone, held level to a degree or two, say nothing of that.
+LITTLE, LEVEL = 1e-5, 1e-3
 
 
 def poses(cameras: Sequence[Camera]) -> tuple[Float64s, Rotation]:
@@ -21,15 +22,20 @@ def poses(cameras: Sequence[Camera]) -> tuple[Float64s, Rotation]:
 
 
 def looked_at(cameras: Sequence[Camera]) -> Float64s:
-    """The point ``[3]`` nearest to all lines of sight; where they are parallel, one in front of the cameras."""
+    """The point ``[3]`` nearest to all lines of sight, in front of the cameras; where these are parallel, some way off.
+
+    Where they part, they meet behind the cameras: what these show is about as far away on the other side.
+    """
     positions, rotations = poses(cameras)
     forward = rotations.as_matrix()[:, :, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     spread = np.linalg.norm(positions - positions.mean(0), axis=1).max() or 1.0
-    ahead = positions.mean(0) + 2 * spread * forward.mean(0)
-    weight = LITTLE * len(positions)
+    ahead = 2 * spread * forward.mean(0)
+    weight = LEVEL * len(positions)
     total = across.sum(0) + weight * np.eye(3)
-    return np.linalg.solve(total, np.einsum("nij,nj->i", across, positions) + weight * ahead)
+    centre = positions.mean(0)
+    met = np.linalg.solve(total, np.einsum("nij,nj->i", across, positions - centre) + weight * ahead)
+    return np.asarray(centre + met - 2 * min(met @ forward.mean(0), 0) * forward.mean(0))
 
 
 def up_of(cameras: Sequence[Camera]) -> Float64s:

@@ -28,11 +28,22 @@ from nsvq_lightning.data.images import ImageHead, Picture
 from nsvq_lightning.data.photo_files import photos_below
 from nsvq_lightning.data.points import RANDOM_POINTS, in_picture, projected
 from nsvq_lightning.data.reconstruct import reconstruct
-from nsvq_lightning.data.scene import View, is_elsewhere, load_cameras, load_scene, seen_by, spread, stretch, usable
+from nsvq_lightning.data.scene import (
+    View,
+    check_cameras,
+    is_elsewhere,
+    load_cameras,
+    load_scene,
+    seen_by,
+    spread,
+    stretch,
+    usable,
+)
 from nsvq_lightning.data.transforms import read_poses
 from nsvq_lightning.io.ply import write_elements
-from nsvq_lightning.rendering.camera import Camera
+from nsvq_lightning.rendering.camera import Camera, camera_of
 from nsvq_lightning.rendering.frame import Frame
+from nsvq_lightning.rendering.poses import view_from
 from nsvq_lightning.training.module import SplatModule
 
 SceneFactory = Callable[..., Path]
@@ -809,17 +820,52 @@ def test_photos_that_keep_their_shape_are_turned_where_others_are(make_scene: Sc
         assert np.abs(scene.view(number).image.numpy() - shown).max() < 25
 
 
-@pytest.mark.parametrize(("photos", "expected"), [(4, 1.0), (40, 5.0), (400, 8.0)])
-def test_a_walk_stretches_farther_than_what_all_photos_show(
-    make_scene: SceneFactory, monkeypatch: pytest.MonkeyPatch, photos: int, expected: float
+@pytest.mark.parametrize(("photos", "expected"), [(4, 1.0), (40, 4.0), (400, 8.0)])
+@pytest.mark.parametrize("way", ["a wall", "a tunnel"])
+def test_a_walk_stretches_farther_than_what_all_photos_show(photos: int, expected: float, way: str) -> None:
+    """Beside each camera is a point that two show from near; in a tunnel, all that come before show it from afar."""
+    axes = {"a wall": np.eye(3), "a tunnel": np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])}[way]
+    lens = (50.0, 50.0, 50.0, 50.0)
+    cameras = [camera_of(view_from(axes, np.array([x, 0.0, 0.0])), lens, 100, 100) for x in range(photos)]
+    first = np.array({"a wall": [0.5, 0, 1], "a tunnel": [1.1, 0, 1]}[way])
+    points = torch.tensor(first + np.eye(3)[0] * np.arange(photos - 1)[:, None]).float()
+    scene: Any = SimpleNamespace(train_cameras=cameras, points=points)
+    assert stretch(scene) == pytest.approx(expected, rel=0.01)
+    scene.points = points + torch.tensor([0.0, 999, 0])  # in no picture
+    assert stretch(scene) == 1.0
+
+
+def test_cameras_of_a_survey_show_it() -> None:
+    """A camera of 3000 shows a thousandth of the ground, and every tenth of them a tenth of it."""
+    down = np.diag([1.0, -1, -1])
+    lens = (50.0, 50.0, 50.0, 50.0)
+    places = np.stack(np.meshgrid(np.arange(60.0), np.arange(50.0), [0.5]), axis=-1).reshape(-1, 3)
+    cameras = [camera_of(view_from(down, place), lens, 100, 100) for place in places]
+    ground = np.random.default_rng(0).uniform((-0.5, -0.5, 0), (59.5, 49.5, 0), (50_000, 3)).astype(np.float32)
+    check_cameras(cameras, ground)
+    with pytest.raises(ValueError, match="of another scene"):
+        check_cameras(cameras, 3 * ground)
+
+
+def test_a_rig_whose_first_camera_is_the_test_is_told(
+    make_scene: SceneFactory, caplog: pytest.LogCaptureFixture
 ) -> None:
-    scene = load_scene(make_scene())
-    assert stretch(scene) == 1.0
-    shown = np.eye(photos, photos + 99, dtype=bool)  # one in each; the others in none
-    monkeypatch.setattr("nsvq_lightning.data.scene.seen_by", lambda *_: shown)
-    assert stretch(scene) == pytest.approx(expected)
-    monkeypatch.setattr("nsvq_lightning.data.scene.seen_by", lambda *_: shown[:, photos:])
-    assert stretch(scene) == 1.0
+    root = make_scene(views=24)
+    load_scene(root)
+    assert not caplog.records
+    model = import_pycolmap().Reconstruction(root / "sparse/0")
+    for image in model.images.values():
+        number = int(image.name[:3])
+        (root / "images" / image.name).rename(root / f"images/{number // 8:05d}_{number % 8}.png")
+        image.name = f"{number // 8:05d}_{number % 8}.png"
+    model.write(root / "sparse/0")
+    scene = load_scene(root)
+    assert {scene.names[view][-6:] for view in scene.test} == {"_0.png"}
+    assert "all 3 test photos end in 0" in caplog.text
+    assert "--data.test_every=9 takes turns" in caplog.text
+    caplog.clear()
+    load_scene(root, test_every=9)
+    assert not caplog.records
 
 
 def test_some_rows_are_spread_over_all() -> None:

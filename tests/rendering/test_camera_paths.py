@@ -13,6 +13,7 @@ from splat_scenes import front_camera, random_splats
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.camera_paths import orbit, read_camera_path, read_cameras, reframed, smooth_path
 from nsvq_lightning.rendering.frame import Frame
+from nsvq_lightning.rendering.poses import looked_at
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.splats import Splats
 
@@ -102,6 +103,25 @@ def test_an_orbit_looks_at_what_the_cameras_look_at(count: int, most: float) -> 
     assert turned == pytest.approx(2 * math.pi * 47 / 48 if most > 6 else most, abs=0.02)
     if most < 6:
         assert min(angles) == pytest.approx(0.3, abs=0.02)
+
+
+@pytest.mark.parametrize("tilt", [0.3, 1.0, 2.0])
+def test_what_a_survey_looks_at_is_below_it(tilt: float) -> None:
+    """Axes that are parallel but for a degree or two do not tell how far away the ground is."""
+    generator = np.random.default_rng(0)
+    for _ in range(5):
+        places = np.stack(np.meshgrid(20.0 * np.arange(15), 20.0 * np.arange(12), [60.0]), axis=-1).reshape(-1, 3)
+        places += generator.normal(size=places.shape)
+        turns = Rotation.from_rotvec(np.radians(tilt) * generator.normal(size=places.shape))
+        down = Rotation.from_matrix(np.diag([1.0, -1, -1]))
+        point = looked_at([camera(place, turn * down) for place, turn in zip(places, turns, strict=True)])
+        assert -500 < point[2] < 60
+        assert point[:2] == pytest.approx([140, 110], abs=20)
+
+
+def test_what_parting_cameras_look_at_is_in_front_of_them() -> None:
+    cameras = [camera([0.1 * x, 0, 0], Rotation.from_euler("Y", 0.05 * x)) for x in range(-5, 6)]
+    assert looked_at(cameras) == pytest.approx([0, 0, 2], abs=0.3)
 
 
 def test_cameras_that_look_one_way_have_an_orbit() -> None:
