@@ -134,7 +134,7 @@ def _photo(scene: Scene, index: int, known: Float64s) -> _Photo:
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
     features = np.empty((0, 2)), np.empty((0, 128), np.float32)
     if scene.grey:
-        sift = cv2.SIFT.create(MAX_FEATURES, enable_precise_upscale=True)
+        sift = cv2.SIFT.create(MAX_FEATURES, contrastThreshold=0, enable_precise_upscale=True)
         points, descriptors = sift.detectAndCompute(grey, None if counts is None else counts.view(np.uint8))
         if points:
             features = np.array([point.pt for point in points]) + 0.5, descriptors

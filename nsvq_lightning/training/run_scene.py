@@ -14,7 +14,7 @@ from torch.optim import Optimizer
 
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.dense_start import dense_points, far_points
-from nsvq_lightning.data.scene import ONE_PLACE, Scene, View, check_cameras, colors_at, spread
+from nsvq_lightning.data.scene import FEW_POINTS, ONE_PLACE, Scene, View, check_cameras, colors_at, spread
 from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
@@ -193,8 +193,10 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
     scene = needed_scene(trainer, "no splats to start from", "set init_from").standard
     if count is None:
         return Splats.from_points(scene.points, scene.colors, sh_degree)
+    scene = replace(scene, grey=scene.grey or len(scene.points) < FEW_POINTS)
     if any(source.masked for source in scene.images.sources):
         # What is always masked is not trained, only in the way.
+        scene = scene.thinned(MOST_POINTS * count or len(scene.points))
         shown = torch.from_numpy(colors_at(scene, scene.points.double().numpy(), 1)[1][:, 0] > 0)
         scene = replace(scene, points=scene.points[shown], colors=scene.colors[shown]) if shown.any() else scene
     points, colors = _with_dense_points(scene, count, seed)

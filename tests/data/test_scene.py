@@ -31,6 +31,7 @@ from nsvq_lightning.data.reconstruct import reconstruct
 from nsvq_lightning.data.scene import (
     View,
     check_cameras,
+    detailed_pixels,
     is_elsewhere,
     load_cameras,
     load_scene,
@@ -820,6 +821,20 @@ def test_photos_that_keep_their_shape_are_turned_where_others_are(make_scene: Sc
         assert np.abs(scene.view(number).image.numpy() - shown).max() < 25
 
 
+def test_detail_is_seen_in_fog_and_in_the_dark_and_rounding_is_none(make_scene: SceneFactory) -> None:
+    """Photos of chequers of 8 pixels: at their edges, a pixel differs from its neighbours, whatever the contrast."""
+    root, found = make_scene(), []
+    chequers = np.kron(np.indices((4, 5)).sum(0) % 2, np.ones((8, 8)))[:, :, None].repeat(3, 2)
+    for low, high in ((0, 255), (100, 125), (0, 12), (100, 101)):
+        for path in (root / "images").iterdir():
+            cv2.imwrite(str(path), (low + (high - low) * chequers).astype(np.uint8))
+        found.append(detailed_pixels(load_scene(root)))
+    bright, fog, dark, rounding = found
+    assert bright > 0
+    assert fog == dark == bright
+    assert rounding == 0
+
+
 @pytest.mark.parametrize(("photos", "expected"), [(4, 1.0), (40, 4.0), (400, 8.0)])
 @pytest.mark.parametrize("way", ["a wall", "a tunnel"])
 def test_a_walk_stretches_farther_than_what_all_photos_show(photos: int, expected: float, way: str) -> None:
@@ -828,7 +843,7 @@ def test_a_walk_stretches_farther_than_what_all_photos_show(photos: int, expecte
     lens = (50.0, 50.0, 50.0, 50.0)
     cameras = [camera_of(view_from(axes, np.array([x, 0.0, 0.0])), lens, 100, 100) for x in range(photos)]
     first = np.array({"a wall": [0.5, 0, 1], "a tunnel": [1.1, 0, 1]}[way])
-    points = torch.tensor(first + np.eye(3)[0] * np.arange(photos - 1)[:, None]).float()
+    points = torch.tensor(first + np.eye(3)[0] * np.arange(photos - 1)[:, None]).float().repeat(1000, 1)
     scene: Any = SimpleNamespace(train_cameras=cameras, points=points)
     assert stretch(scene) == pytest.approx(expected, rel=0.01)
     scene.points = points + torch.tensor([0.0, 999, 0])  # in no picture

@@ -127,6 +127,21 @@ def test_points_that_are_always_masked_become_no_splats(
     assert len(first_splats(trainer, 0, None, 0)) == len(shown)  # as in 3DGS
 
 
+@pytest.mark.parametrize(("points", "fills"), [(20, True), (run_scene.FEW_POINTS + 9, False)])
+def test_few_points_only_fill_up_what_photos_show(
+    make_scene: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, points: int, fills: bool
+) -> None:
+    shown = torch.rand(100, 3)
+    monkeypatch.setattr(run_scene, "dense_points", lambda *_: (shown, shown))
+    monkeypatch.setattr(run_scene, "far_points", lambda *_: (torch.empty(0, 3), torch.empty(0, 3)))
+    data = ColmapDataModule(str(make_scene(points=points)))
+    known = len(data.scene.points)  # some are at a camera's centre
+    trainer: Any = SimpleNamespace(datamodule=data)
+    first = first_splats(trainer, 0, known + 100, 0).means.detach()
+    assert len(first) == known + 100
+    assert torch.equal(first[:100] if fills else first[-100:], shown)
+
+
 def test_a_lone_point_before_the_cameras_does_not_hide_the_scene(make_scene: Callable[..., Path]) -> None:
     data = ColmapDataModule(str(make_scene()))
     scene = replace(data.scene, frame=Frame())
