@@ -32,7 +32,7 @@ def step_seconds(scene: Scene, count: int, device: torch.device | str = "cpu") -
         count: Number of splats.
         device: Where to train.
     """
-    scene = scene.standard
+    scene = scene.standard.thinned(count)  # as many as a run takes
     splats = grown(scene, count).to(device)
     adam = optim.build_adam(optim.param_groups(splats, {}, optim.LearningRates(), scene.extent))
     views = [scene.view(index).to(device) for index in spread(scene.train, VIEWS)]

@@ -73,6 +73,20 @@ def test_a_step_is_timed_on_views_of_the_scene(scene: Scene, monkeypatch: pytest
     assert next(clock, None) is None  # compiling kernels, in the first view, does not count
 
 
+def test_a_step_of_few_splats_is_timed_with_few(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of more points than a run has splats, it starts with some."""
+    timed = []
+
+    def noted(scene: Scene, count: int) -> Splats:
+        timed.append(len(splats := grown(scene, count)))
+        return splats
+
+    monkeypatch.setattr(forecast, "grown", noted)
+    assert len(scene.points) > 100
+    step_seconds(scene, 100)
+    assert timed == [100]
+
+
 def test_iterations_are_weighed_by_their_share_of_a_run(scene: Scene, a_splat_takes_a_millisecond: None) -> None:
     parts = [(0.5, 1000), (0.25, 4000), (0.25, 2000), (0.0, 10**9)]
     assert iteration_seconds(scene, parts) == pytest.approx(LOOP * 2.0)
