@@ -114,7 +114,7 @@ class MetricReport(WritingCallback):
             return
         if not getattr(scene_of(trainer), "test", ()):
             return
-        views = trainer.datamodule.test_dataloader()  # type: ignore[attr-defined]  # Lightning does not type it
+        views = trainer.datamodule.val_dataloader()  # type: ignore[attr-defined]  # Lightning does not type it
         with module.stopwatch.paused(module.device), self._beside.timed("evaluations"):
             self._evaluate(trainer, module, iteration, views)
             notify_monitors(trainer, module)

@@ -11,11 +11,11 @@ import torch
 from lightning.pytorch import LightningDataModule
 from lightning.pytorch.overrides.distributed import UnrepeatedDistributedSampler
 from lightning.pytorch.utilities import rank_zero_info
-from torch.utils.data import DataLoader, Dataset, IterableDataset
+from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_info
 
 from nsvq_lightning.data.colmap import SceneError, size_range
 from nsvq_lightning.data.images import Picture
-from nsvq_lightning.data.scene import Factor, Scene, View, load_scene, usable
+from nsvq_lightning.data.scene import Factor, Scene, View, load_scene, spread, usable
 from nsvq_lightning.random import generator
 
 
@@ -87,6 +87,10 @@ def _spare(device: torch.device) -> int:
 DEMO = Path(__file__).parent / "demo"
 
 
+# Test views that are looked at during a run. With all of 3000 photos, that would take as long as to train.
+VALIDATED = 50
+
+
 class SceneDataModule(LightningDataModule):
     """Views of a scene, one per batch.
 
@@ -136,10 +140,12 @@ class SceneDataModule(LightningDataModule):
         return DataLoader(_TrainViews(self), batch_size=None)
 
     def val_dataloader(self) -> DataLoader[View]:
+        """This process's share of at most :data:`VALIDATED` test views, evenly taken, in the order of their names."""
+        return self._ordered(spread(self.scene.test, VALIDATED))
+
+    def test_dataloader(self) -> DataLoader[View]:
         """This process's share of the test views, in the order of their names."""
         return self._ordered(self.scene.test)
-
-    test_dataloader = val_dataloader
 
     def predict_dataloader(self) -> DataLoader[View]:
         """This process's share of all views, in the order of their names."""
@@ -241,6 +247,8 @@ class _TrainViews(IterableDataset[View]):
 
     def __iter__(self) -> Iterator[View]:
         scene = self.data.scene
+        if get_worker_info():
+            raise ValueError("photos are decoded ahead here, and each worker would give all of them: set num_workers=0")
         order = view_order(len(scene.train), self.data.seed, *self.data.process, self.data.draw)
         for current, following in pairwise(order):
             scene.images.prefetch(scene.train[following])

@@ -95,20 +95,25 @@ def _facts(history: Rows, schedule: Schedule, metrics: Values | None) -> dict[st
     }
 
 
+# Test views on the page, at most: each takes about 0.3 MB. All are in the folder.
+SHOWN = 50
+
+
 def _views(folder: Path, views: Rows) -> str:
-    """Photo, render and error of each view, which lie side by side in its picture; ``report.js`` adds the slider."""
-    worst = min((row["psnr"] for row in views), default=0.0)
+    """Photo, render and error of the worst views, side by side in its picture; ``report.js`` adds the slider."""
+    lowest = sorted(row["psnr"] for row in views)[:SHOWN]
     figures = []
     for row in views:
         path = folder / "renders" / row["picture"]
-        if not path.exists():
+        if row["psnr"] not in lowest or not path.exists():
             continue
-        remark = ", the lowest" if row["psnr"] == worst and len(views) > 1 else ""
+        remark = ", the lowest" if row["psnr"] == lowest[0] and len(views) > 1 else ""
         caption = f"{escape(row['name'])}: {_decibels(row['psnr'])}, SSIM {row['ssim']:.4f}{remark}"
         parts = zip(("photo", "render", "error"), np.array_split(_read(path), 3, axis=1), strict=True)
         pictures = "".join(f'<img alt="{part}" src="{_jpeg(picture)}">' for part, picture in parts)
         figures.append(f"<figure>{pictures}<figcaption>{caption}</figcaption></figure>")
-    return f'<div class="views">{"".join(figures)}</div>' if figures else ""
+    more = f"<p>The {SHOWN} lowest of {len(views)}; the folder renders has all.</p>" if len(views) > SHOWN else ""
+    return f'{more}<div class="views">{"".join(figures)}</div>' if figures else ""
 
 
 def _curve(history: Rows, schedule: Schedule) -> str:

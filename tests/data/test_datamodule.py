@@ -13,6 +13,7 @@ from lightning.pytorch import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.utilities.model_helpers import is_overridden
 from runs import quiet_trainer
 from torch import Tensor, nn
+from torch.utils.data import DataLoader
 
 from nsvq_lightning.data import datamodule
 from nsvq_lightning.data.colmap import SceneError
@@ -101,6 +102,22 @@ def test_processes_share_the_train_sequence_and_the_test_views(make_scene: Scene
     assert [name for pair in zip(*draws, strict=True) for name in pair] == whole
     shares = [[view.index for view in _on(ColmapDataModule(root), 0, r, 3).val_dataloader()] for r in range(3)]
     assert shares == [[0, 24], [8], [16]]  # nothing padded
+
+
+def test_some_of_many_test_views_are_looked_at_during_a_run(
+    make_scene: SceneFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = ColmapDataModule(str(make_scene(views=33)))
+    assert [view.index for view in data.val_dataloader()] == [0, 8, 16, 24, 32]
+    monkeypatch.setattr(datamodule, "VALIDATED", 3)
+    assert [view.index for view in data.val_dataloader()] == [0, 16, 32]
+    assert [view.index for view in data.test_dataloader()] == [0, 8, 16, 24, 32]
+
+
+def test_workers_that_would_each_give_all_views_are_refused(make_scene: SceneFactory) -> None:
+    loader = ColmapDataModule(str(make_scene())).train_dataloader()
+    with pytest.raises(ValueError, match="set num_workers=0"):
+        next(iter(DataLoader(loader.dataset, batch_size=None, num_workers=1)))
 
 
 def test_overfitting_repeats_the_first_views(make_scene: SceneFactory) -> None:

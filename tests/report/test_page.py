@@ -155,6 +155,14 @@ def test_page_of_a_running_fit_shows_a_view_and_is_read_again(run: Path) -> None
     assert preview[:, 550].min() > 247
 
 
+def test_of_many_views_the_page_has_the_lowest(run: Path) -> None:
+    views = [VIEWS[0] | {"name": f"{number:03d}.jpg", "psnr": 20.0 + number % 53} for number in range(53)]
+    text = write_page(run, HISTORY, SCHEDULE, {}, METRICS, views).read_text()
+    assert "The 50 lowest of 53" in text
+    assert [f"{number:03d}.jpg" in text for number in (0, 49, 50, 52)] == [True, True, False, False]
+    assert text.count(", the lowest") == 1
+
+
 def test_a_picture_that_is_none_any_more_is_named(run: Path) -> None:
     (run / "renders" / "a.png").write_bytes(b"nothing")
     with pytest.raises(OSError, match=r"a\.png is not a picture any more; run 'nsvq test' again"):
