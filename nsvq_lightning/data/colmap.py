@@ -429,9 +429,8 @@ def larger_models(root: Path) -> str | None:
 def _observations(rows: Sequence[tables.ImageRow], tracks: Sequence[Sequence[int]]) -> Int64s:
     """Pairs of point row and image row, each once: a track may have two features in one image."""
     row_of = {image.number: row for row, image in enumerate(rows)}
-    pairs = [(point, row_of.get(image, -1)) for point, track in enumerate(tracks) for image in track]
-    sightings = np.array(pairs, np.int64).reshape(-1, 2)
-    lost = sightings[:, 1] < 0
-    if lost.any():
-        log.warning(f"left out {lost.sum()} sightings by images that the model does not have")
-    return np.unique(sightings[~lost], axis=0)
+    points = np.repeat(np.arange(len(tracks)), [len(track) for track in tracks])
+    images = np.fromiter((row_of.get(image, -1) for track in tracks for image in track), np.int64, len(points))
+    if lost := np.count_nonzero(images < 0):
+        log.warning(f"left out {lost} sightings by images that the model does not have")
+    return np.unique(np.stack([points, images], axis=1)[images >= 0], axis=0)
