@@ -208,9 +208,9 @@ class SplatCLI(LightningCLI):
         settings = self._get(self.config_init, "trainer")
         # Lightning refuses such a callback if the flag disables it, and the default callbacks include one of each.
         unwanted: tuple[type, ...] = (type(None),)
-        if settings.enable_progress_bar is False:
+        if settings.barebones or settings.enable_progress_bar is False:
             unwanted += (ProgressBar,)
-        if settings.enable_checkpointing is False:
+        if settings.barebones or settings.enable_checkpointing is False:
             unwanted += (Checkpoint,)
         parser = self._parser(self.subcommand)
         keys = parser.callback_keys

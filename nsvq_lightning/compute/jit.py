@@ -61,7 +61,8 @@ class _Compilations(event.Listener):
         if not self.levels:
             self.since = perf_counter()
             if self.seconds == 0:
-                log.info("compiling kernels, once on this machine: a quarter of a minute to one")
+                kept = kernel_cache.kernel_folder() or "no folder"
+                log.info(f"compiling kernels, kept in {kept}: a quarter of a minute to one")
         level = numba.config.OPT
         self.levels.append(level)
         if compilation.data["dispatcher"].targetoptions.get("forceinline"):

@@ -87,6 +87,11 @@ def test_checkpoints_of_the_command_line_are_plain_data_and_load(finished: Path)
     assert getattr(module.quantizers["scales"], "kmeans_steps", None) == 3
 
 
+def test_a_bare_trainer_needs_no_other_option(demo_scene: Path, tmp_path: Path) -> None:
+    assert main(fit(demo_scene, tmp_path, "--trainer.barebones=true", steps=2)) == 0
+    assert not list(tmp_path.rglob("last.ckpt"))
+
+
 def test_a_run_goes_on_with_the_options_given_and_counts_its_lines(
     demo_scene: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
