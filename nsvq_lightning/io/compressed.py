@@ -12,6 +12,7 @@ import numpy as np
 from nsvq_lightning.io.errors import FormatError
 from nsvq_lightning.rendering.sampling import MAX_CAMERAS, Sampling, fewer_cameras
 from nsvq_lightning.splats import attributes as splat
+from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.conventions import ZERO, Arrays, Bools, Float32s, Float64s, Integers, Place, shN_degree
 
 if TYPE_CHECKING:
@@ -131,15 +132,19 @@ class CompressedScene:
         named: Any = tensors._asdict() if isinstance(tensors, RawSplats) else tensors
         if not isinstance(named, Mapping):
             raise TypeError(f"splats must be Splats, or tensors by name, got {type(splats)}; nl.load reads a file")
+        of_trainer = named.get("splats", named.get("pipeline", named))  # gsplat, nerfstudio
+        given = {name.rpartition(".")[2]: values for name, values in of_trainer.items()}
         rows = {
-            key: values.detach().to("cpu", torch.float32, copy=True).numpy()
+            NAMES[name]: values.detach().to("cpu", torch.float32, copy=True).numpy()
             if isinstance(values, torch.Tensor)
             else np.array(values, np.float32)
-            for name, values in named.get("splats", named.get("pipeline", named)).items()  # of gsplat, nerfstudio
-            if (key := NAMES.get(name.rpartition(".")[2]))
+            for name, values in given.items()
+            if name in NAMES
         }
         if missing := set(splat.ATTRIBUTES) - {"shN"} - rows.keys():
             raise ValueError(f"the splats have no {', '.join(sorted(missing))}")
+        if "features_dc" in given and not rows.get("shN", rows["sh0"]).size:  # nerfstudio's of degree 0: logits
+            rows["sh0"] = 0.5 * np.tanh(0.5 * rows["sh0"]) / conventions.SH_C0
         logits = rows["opacities"]
         if logits.size and 0 <= logits.min() < logits.max() <= 1:
             log.warning("all opacities are in [0, 1]: logits are expected, and logarithms of scales")
@@ -382,7 +387,7 @@ def _check_floats(name: str, array: Float32s, shape: tuple[int, ...]) -> None:
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {list(shape)}, got {list(array.shape)}")
     if array.dtype != np.float32:  # nothing is rounded silently
-        raise TypeError(f"{name} must be float32, got {array.dtype}; convert it with .astype(np.float32)")
+        raise TypeError(f"{name} must be float32, got {array.dtype}")
 
 
 def _check_codes(name: str, codes: Integers, codebook: Float32s, n: int, dim: int) -> None:

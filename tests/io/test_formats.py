@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,10 @@ def test_attributes_by_name_are_saved_as_they_come(tmp_path: Path) -> None:
     model.camera_optimizer = torch.nn.Linear(3, 3)
     save(model, tmp_path / "c.ply")
     assert all(torch.equal(getattr(load(tmp_path / "c.ply"), name), each) for name, each in splats.attributes().items())
+    named |= {"features_rest": torch.zeros(7, 0, 3), "features_dc": torch.tensor([[0.0, 2, -2]]).repeat(7, 1)}
+    save(named, tmp_path / "d.ply")  # those without harmonics are logits of colours there
+    colours = 0.5 + 0.5 / math.sqrt(math.pi) * load(tmp_path / "d.ply").sh0[:, 0]
+    assert torch.allclose(colours, torch.tensor([0.0, 2, -2]).sigmoid().expand(7, 3), atol=1e-6)
     del named["scales"]
     with pytest.raises(ValueError, match="the splats have no scales"):
         save(named, tmp_path / "a.ply")
