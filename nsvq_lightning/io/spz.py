@@ -332,6 +332,8 @@ def write_spz(
         "shN": _packed(scene, "shN", 128 * harmonics, 128, clamped),
     }
     clamped.warn(path, len(scene))
+    if fraction * math.log(2) < -np.median(scene.rows("scales")):
+        logger.warning(f"{path}: positions are rounded by half a splat, as they are far from 0: move them there first")
     flags = ANTIALIASED * scene.antialiased
     return _write_frame(path, SpzHeader(version, len(scene), scene.sh_degree, fraction, flags, stated), arrays)
 

@@ -15,7 +15,7 @@ from splat_scenes import ball
 
 import nsvq_lightning as nl
 from nsvq_lightning.callbacks.forecast import grown
-from nsvq_lightning.compression.compressor import SLACK, Compressor, Setting, setting_for
+from nsvq_lightning.compression.compressor import SLACK, THINNEST, Compressor, Setting, setting_for
 from nsvq_lightning.compression.viewpoints import Measure, own_scene, pictures
 from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io import CompressedScene
@@ -164,6 +164,28 @@ def test_level_paper_and_scenes_without_harmonics_are_compressed() -> None:
     plain = compressor(ball(200, degree=0))
     assert sorted(plain.at(Setting(200, "0.5k")).scene.codes) == ["quats", "scales", "sh0"]
     assert plain.finest_within(10**6, 200).setting == Setting(200, "none")
+
+
+def test_axes_too_short_to_show_cost_nothing() -> None:
+    whole = ball(300)
+    scales = whole.rows("scales").copy()
+    thick, flat, disc = scales.copy(), scales.copy(), scales[:, :2].max(1)
+    thick[:, 2], flat[:, 2] = disc - THINNEST, -60.0
+    plain, setting = {**whole.raw}, Setting(300, "none")
+    thick_scene, flat_scene = (replace(whole, raw=plain | {"scales": each}) for each in (thick, flat))
+    assert compressor(flat_scene).at(setting).data == compressor(thick_scene).at(setting).data
+    exact = compressor(flat_scene, storage=Storage("paper")).at(setting)
+    assert (exact.scene.rows("scales")[:, 2] == -60).all()
+
+
+def test_few_splats_without_harmonics_have_no_codebooks(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, coloured = compressor(ball(2000, degree=0)), compressor(ball(300, degree=1))
+    none = plain.at(Setting(2000, "none"))
+    assert plain.best(2000, None, None, None).setting == none.setting
+    assert plain.best(2000, "16k", None, None).setting.codebooks == "16k"
+    assert coloured.best(300, None, None, None).setting.codebooks == "16k"
+    monkeypatch.setattr("nsvq_lightning.compression.compressor.ON_BASIS", 1000)
+    assert plain.finest_within(len(none.data), 2000).setting == none.setting
 
 
 @pytest.mark.parametrize("scale", [0.01, 100.0])

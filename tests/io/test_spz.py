@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -122,6 +123,15 @@ def test_of_degree_4_the_first_three_are_read(tmp_path: Path, degree: int, caplo
     read = read_scene(tmp_path / "x.spz")
     np.testing.assert_allclose(read.values("shN"), (levels[:, :15] - 128.0) / 128)
     assert ("of SH degree 4, degrees up to 3 are read" in caplog.text) == (degree == 4)
+
+
+def test_a_scene_too_far_away_for_its_steps_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    scene = plain_scene(50)
+    save(scene, tmp_path / "a.spz")
+    assert not caplog.records
+    scene = replace(scene, raw={**scene.raw, "scales": scene.rows("scales") - 2})
+    save(replace(scene, means=scene.means + np.float32(1e5)), tmp_path / "a.spz")
+    assert "positions are rounded by half a splat" in caplog.text
 
 
 def test_flags_that_are_not_known_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
