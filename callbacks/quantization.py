@@ -65,8 +65,7 @@ class CanonicalCovariance(SplatCallback):
 
 def perplexity(usage: Tensor) -> float:
     """Number of equally used codes with the entropy of ``usage [K]``: exp(-Σ p·log p); 0 if none is used."""
-    entropy = torch.special.entr(usage.double() / usage.sum()).sum()
-    return float(entropy.exp()) if usage.any() else 0.0
+    return float(torch.special.entr(usage.double() / usage.sum()).sum().exp()) if usage.any() else 0.0
 
 
 @dataclass(eq=False)

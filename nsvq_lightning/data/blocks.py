@@ -164,9 +164,8 @@ def cut(scene: Scene, count: int, **options: Any) -> list[Block]:
             outer[bound, axis] = end
             return parts(some & inside, inner, outer, share)
 
-        low = side(below, 1, min(upper, seam + reach), first)
-        high = side(~below, 0, max(lower, seam - reach), number - first)
-        return low + high
+        low, high = max(lower, seam - reach), min(upper, seam + reach)
+        return side(below, 1, high, first) + side(~below, 0, low, number - first)
 
     everywhere = np.array([[-_FAR] * 2, [_FAR] * 2])
     return parts(np.ones(len(points), bool), everywhere, everywhere, count)

@@ -98,12 +98,7 @@ RECORD = "prepare.json"
 
 
 def reconstruct(
-    scene: Path,
-    photos: Heads,
-    report: Report,
-    is_video: bool = False,
-    max_size: int = 1600,
-    threads: int = -1,
+    scene: Path, photos: Heads, report: Report, is_video: bool = False, max_size: int = 1600, threads: int = -1
 ) -> Verdict:
     """Find the cameras of the photos in ``scene/images`` and write them to ``scene/sparse/0``.
 
