@@ -270,8 +270,8 @@ class Compressor:
 
     def _finest_coded(self, target: int, splats: int, needed: bool) -> Candidate | None:
         """The best file with codebooks of at most ``target`` bytes; too few are refused only where it is needed."""
-        best = before = None
-        asked = float(target)
+        tried: list[Candidate | None] = []
+        before, asked = None, float(target)
         for _ in range(ESTIMATES):
             try:
                 setting = setting_for(int(asked), splats, self.scene.sh_degree, self.parts)
@@ -282,15 +282,18 @@ class Compressor:
             found = self._fitting(setting, target)
             if not found and setting.more:
                 found = self._fitting(setting._replace(more=0), target)
-            if found and (best is None or self.error(found) < self.error(best)):
-                best = found
+            tried.append(found)
             # There may be more room than the largest codebooks take.
             if self.stopped or (found and (len(found.data) >= (1 - 2 * SLACK) * target or setting == before)):
                 break
             before = setting
             # What the estimate made of its bytes.
-            made = found or self.at(setting._replace(turn=1.0))
-            asked *= (1 - SLACK / 2) * target / len(made.data)
+            asked *= (1 - SLACK / 2) * target / len((found or self.at(setting._replace(turn=1.0))).data)
+        best = min(filter(None, tried), key=self.error, default=None)
+        if best and setting.splats < splats and not self.stopped:
+            # All splats with the next smaller codebooks take fewer bytes, and may be better.
+            smaller = [*attributes.SIZES, setting.codebooks][[*attributes.SIZES].index(setting.codebooks) + 1]
+            best = min(filter(None, (best, self._fitting(Setting(splats, smaller), target))), key=self.error)
         return best
 
     def smallest_within(self, error: float, splats: int) -> Candidate:

@@ -294,6 +294,18 @@ def test_of_files_within_a_limit_the_best_is_taken(monkeypatch: pytest.MonkeyPat
     assert compressor._finest_coded(20_000, 300, False) is made[0]
 
 
+def test_all_splats_with_smaller_codebooks_are_tried_where_some_would_go() -> None:
+    scene = ball(3000, degree=0)
+    small = Compressor(scene, cameras_around(scene.means, 8, 80, 60), steps=4)
+    whole = small.at(Setting(3000, "0.5k"))
+    target = round(1.01 * len(whole.data))
+    assert setting_for(target, 3000, 0) == Setting(2848, "1k")
+    found = small._finest_coded(target, 3000, needed=True)
+    assert found is not None
+    assert len(found.data) <= target
+    assert small.error(found) <= small.error(whole)
+
+
 @pytest.mark.parametrize("share", [0.9, 1.5])
 def test_a_limit_holds_for_the_file_that_is_saved(tmp_path: Path, share: float) -> None:
     scene = ball(300)
