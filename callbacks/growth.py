@@ -12,7 +12,7 @@ from lightning.pytorch import Trainer
 from torch import Tensor
 
 from nsvq_lightning.data.images import edges_of
-from nsvq_lightning.data.scene import View, detailed_pixels, stretch
+from nsvq_lightning.data.scene import Scene, View, detailed_pixels, stretch
 from nsvq_lightning.io.nsvq.precision import Precision
 from nsvq_lightning.random import draw_rows, generator, top_rows
 from nsvq_lightning.rendering.rasterize import Render
@@ -80,11 +80,9 @@ class SplatBudget(SplatCallback):
             detail = distributed.on_first_process(trainer, partial(detailed_pixels, scene))
             far = stretch(scene)
             budget = splats_for_photos(len(scene.train), detail, far * self.quality)
-            reason = (
-                f"quality {self.quality:g} times what {len(scene.train)} photos with {detail:,.0f} detailed pixels "
-                f"each support{f', {far:.1f} times as each shows little of the scene' if far > 1 else ''}; --quality "
-                "changes it"
-            )
+            shown = f"{len(scene.train)} photos with {detail:,.0f} detailed pixels each support"
+            walk = f", {far:.1f} times as each shows little of the scene" if far > 1 else ""
+            reason = f"quality {self.quality:g} times what {shown}{walk}; --quality changes it"
         module.splat_budget, module.first_points = budget, round(self.start * budget)
         log.info(f"budget: {budget} splats, {reason}")
 
@@ -171,7 +169,8 @@ class BudgetedGrowth(Densification):
     reset_last: int = 0
     """Last opacity reset; 0 for none. Long runs need them (docs/recipe.md)."""
     reset_photos: Whole = 40
-    """None with fewer train photos, or without a scene: what resets clear away would not come back in its place."""
+    """None with fewer train photos, or of a walk, or without a scene: what resets clear away would not come back in its
+    place."""
     reset_opacity: Opacity = 0.05
     """Opacities are reset to at most this."""
     recovery: Count = 600
@@ -257,22 +256,22 @@ class BudgetedGrowth(Densification):
             self._split_and_prune(module, iteration)
             if module.schedule is not schedule:  # the phase has ended
                 return
-        photos = getattr(run_scene.scene_of(trainer), "train", ())
-        resets = schedule.reset_times(self.reset_last * (len(photos) >= self.reset_photos), self.reset_every)
-        if iteration in resets:
-            reset_opacities(module, self.reset_opacity)
-        if iteration in (reset + schedule.interval(self.recovery) for reset in resets):
-            transparency = -module.splats.opacities
-            self.prune(module, top_rows(transparency, int(self.recovery_share * len(transparency))))
+        resets = schedule.reset_times(self.reset_last, self.reset_every)
+        recoveries = [reset + schedule.interval(self.recovery) for reset in resets]
+        if iteration in (*resets, *recoveries) and _around(run_scene.scene_of(trainer)) >= self.reset_photos:
+            if iteration in resets:
+                reset_opacities(module, self.reset_opacity)
+            if iteration in recoveries:
+                transparency = -module.splats.opacities
+                self.prune(module, top_rows(transparency, int(self.recovery_share * len(transparency))))
 
     def _split_and_prune(self, module: SplatModule, iteration: int) -> None:
         """Split, prune unless it is the last time, and end the phase where splitting has become idle."""
         schedule = module.schedule
         last = schedule.ends[Phase.WARMUP]
         room, added = self._grow(module, iteration)
-        pruned = 0
-        if any(self.is_due(module, later) for later in range(iteration + 1, last + 1)):
-            pruned = self.prune(module, module.splats.opacities.sigmoid() < self.min_opacity)
+        again = any(self.is_due(module, later) for later in range(iteration + 1, last + 1))
+        pruned = self.prune(module, module.splats.opacities.sigmoid() < self.min_opacity) if again else 0
         distributed.check_replicas(module.trainer, "growth")
         log.debug(f"iteration {iteration}: +{added} -{pruned} splats, now {len(module.splats)}")
         self.idle = self.idle + 1 if added < IDLE * min(room, len(module.splats)) else 0
@@ -290,13 +289,17 @@ class BudgetedGrowth(Densification):
         gradients, views, edges = (splats.add_table(name) for name in self.tables)
         statistic = gradients / views.clamp(min=1)
         reference = schedule.reference(iteration)
-        late = reference > self.full
-        weight, threshold = (statistic, self.late_threshold) if late else (edges, self.grad_threshold)
+        weight, threshold = (statistic, self.late_threshold) if reference > self.full else (edges, self.grad_threshold)
         candidates = torch.where(statistic >= threshold, weight, 0)
         progress = min(max((reference - self.start) / (self.full - self.start), 0.0), 1.0)
         room = int(self.limit(module) * math.sqrt(progress)) - len(splats)
         divided = draw_rows(candidates, room, generator(module.seed, iteration, "grow"))
         return room, self.divide(module, divided, split_longest(detached(splats).take(divided)))
+
+
+def _around(scene: Scene | None) -> int:
+    """Train photos around a place; 0 of a walk, whose places are in few."""
+    return len(scene.train) if scene and stretch(scene) < 2 else 0
 
 
 def splats_for_photos(photos: int, detail: float, quality: float = 1.0) -> int:

@@ -192,7 +192,20 @@ def test_opacities_are_not_reset_where_photos_are_few() -> None:
     for photos, ceiling in ((39, 0.9), (40, 0.05)):
         stage = stage_of([0.9] * 10, BudgetedGrowth(**RULES | {"reset_photos": 40}, budget=1000))
         images = SimpleNamespace(edges=lambda index: edges_of(PHOTO, None))
-        stage.trainer.datamodule = SimpleNamespace(scene=SimpleNamespace(train=range(photos), images=images))
+        scene = SimpleNamespace(
+            train=range(photos), images=images, points=torch.zeros(0, 3), train_cameras=[BATCH.camera]
+        )
+        stage.trainer.datamodule = SimpleNamespace(scene=scene)
+        stage.step(40, batch=BATCH)
+        assert stage.opacities == pytest.approx([ceiling] * 10)
+
+
+def test_opacities_are_not_reset_along_a_walk(monkeypatch: pytest.MonkeyPatch) -> None:
+    for far, ceiling in ((2.5, 0.9), (1.5, 0.05)):
+        monkeypatch.setattr("nsvq_lightning.callbacks.growth.stretch", lambda _, far=far: far)
+        stage = stage_of([0.9] * 10, BudgetedGrowth(**RULES | {"reset_photos": 40}, budget=1000))
+        images = SimpleNamespace(edges=lambda index: edges_of(PHOTO, None))
+        stage.trainer.datamodule = SimpleNamespace(scene=SimpleNamespace(train=range(40), images=images))
         stage.step(40, batch=BATCH)
         assert stage.opacities == pytest.approx([ceiling] * 10)
 
