@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 from warnings import catch_warnings
 
@@ -289,12 +290,11 @@ class Compressor:
             before = setting
             # What the estimate made of its bytes.
             asked *= (1 - SLACK / 2) * target / len((found or self.at(setting._replace(turn=1.0))).data)
-        best = min(filter(None, tried), key=self.error, default=None)
-        if best and setting.splats < splats and not self.stopped:
+        if any(tried) and setting.splats < splats and not self.stopped:
             # All splats with the next smaller codebooks take fewer bytes, and may be better.
-            smaller = [*attributes.SIZES, setting.codebooks][[*attributes.SIZES].index(setting.codebooks) + 1]
-            best = min(filter(None, (best, self._fitting(Setting(splats, smaller), target))), key=self.error)
-        return best
+            smaller = dict(pairwise(attributes.SIZES)).get(setting.codebooks, setting.codebooks)
+            tried.append(self._fitting(Setting(splats, smaller), target))
+        return min(filter(None, tried), key=self.error, default=None)
 
     def smallest_within(self, error: float, splats: int) -> Candidate:
         """The smallest file with this many splats and an error of at most ``error``.

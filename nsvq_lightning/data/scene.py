@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeVar, get_args
 import cv2
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree, distance_matrix
 from torch import Tensor
 from tqdm import tqdm
 
@@ -630,10 +630,10 @@ def stretch(scene: Scene) -> float:
 
     It is 1 where a fifth of the train photos or more show the usual point, or few points say so.
     """
-    cameras, places = spread(scene.train_cameras, SOME_CAMERAS), spread(scene.points, SOME_SPLATS).double()
-    apart = torch.cdist(torch.tensor([camera.packed_view[12:] for camera in cameras], dtype=torch.float64), places)
-    apart[~torch.from_numpy(seen_by(cameras, places.numpy()))] = math.inf
+    cameras, places = spread(scene.train_cameras, SOME_CAMERAS), spread(scene.points, SOME_SPLATS).double().numpy()
+    apart = distance_matrix([camera.packed_view[12:] for camera in cameras], places)
+    apart[~seen_by(cameras, places)] = math.inf
     # What is more than twice as far away as in the nearest photo, as behind a wall, is not shown.
-    shares = (apart < 2 * apart.amin(0)).numpy().mean(0)
+    shares = (apart < 2 * apart.min(0)).mean(0)
     shares = shares[shares > 0]
     return float(np.clip(0.2 / np.median(shares), 1, 8)) if len(shares) >= FEW_POINTS else 1.0

@@ -27,15 +27,15 @@ def looked_at(cameras: Sequence[Camera]) -> Float64s:
     Where they part, they meet behind the cameras: what these show is about as far away on the other side.
     """
     positions, rotations = poses(cameras)
+    arms = positions - positions.mean(0)
     forward = rotations.as_matrix()[:, :, 2]
+    ahead = forward.mean(0)
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    spread = np.linalg.norm(positions - positions.mean(0), axis=1).max() or 1.0
-    ahead = 2 * spread * forward.mean(0)
+    spread = np.linalg.norm(arms, axis=1).max() or 1.0
     weight = LEVEL * len(positions)
     total = across.sum(0) + weight * np.eye(3)
-    centre = positions.mean(0)
-    met = np.linalg.solve(total, np.einsum("nij,nj->i", across, positions - centre) + weight * ahead)
-    return np.asarray(centre + met - 2 * min(met @ forward.mean(0), 0) * forward.mean(0))
+    met = np.linalg.solve(total, np.einsum("nij,nj->i", across, arms) + weight * (2 * spread * ahead))
+    return np.asarray(positions.mean(0) + met - 2 * min(met @ ahead, 0) * ahead)
 
 
 def up_of(cameras: Sequence[Camera]) -> Float64s:

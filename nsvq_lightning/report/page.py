@@ -100,7 +100,7 @@ SHOWN = 50
 
 
 def _views(folder: Path, views: Rows) -> str:
-    """Photo, render and error of the worst views, side by side in its picture; ``report.js`` adds the slider."""
+    """Photo, render and error of the worst views, side by side in a picture; ``report.js`` adds the slider."""
     lowest = sorted(row["psnr"] for row in views)[:SHOWN]
     figures = []
     for row in views:
