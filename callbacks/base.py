@@ -1,7 +1,9 @@
 """What callbacks share: the check of the module, acting once per step, the folder of the run, the search for NaN."""
 
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, dataclass_transform
 
 import numpy as np
 from lightning.pytorch import Callback, Trainer
@@ -17,6 +19,7 @@ from nsvq_lightning.training.run_scene import scene_of
 from .settings import check_settings
 
 
+@dataclass_transform(eq_default=False, field_specifiers=(field,))
 class SplatCallback(Callback):
     """Base of the callbacks that train a :class:`nsvq_lightning.SplatModule`.
 
@@ -25,10 +28,10 @@ class SplatCallback(Callback):
     accumulation Lightning calls the hooks that they come from for every view of the iteration. A subclass that
     overrides ``setup``, or one of these hooks beside its method, calls it here first.
 
-    A callback is a dataclass whose fields are its settings: the types of :mod:`nsvq_lightning.callbacks.settings` say
-    what they may be, the text below each is its help. What it has reached are attributes without an annotation, or
-    with ``init=False``; :attr:`state` names those that checkpoints carry. One that overrides ``__post_init__`` calls
-    it here, for the check of the settings.
+    Each subclass is made a dataclass, whose fields are its settings: the types of
+    :mod:`nsvq_lightning.callbacks.settings` say what they may be, the text below each is its help. What it has reached
+    are attributes without an annotation, or with ``init=False``; :attr:`state` names those that checkpoints carry. One
+    that overrides ``__post_init__`` calls it here, for the check of the settings.
 
     A callback that acts at certain iterations has a method ``is_due(module, iteration)``, and acts where that is true:
     a subclass changes when by overriding it.
@@ -44,6 +47,7 @@ class SplatCallback(Callback):
     state: ClassVar[tuple[str, ...]] = ()
     passing: ClassVar[tuple[str, ...]] = ()
     _acted: ClassVar[dict[str, int]] = {}
+    __init_subclass__ = classmethod(partial(dataclass, eq=False))
 
     def __post_init__(self) -> None:
         check_settings(self)

@@ -3,7 +3,6 @@
 import logging
 import signal
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from threading import current_thread, main_thread
 from types import FrameType
@@ -95,7 +94,6 @@ class GracefulStop:
             self._handlers[number](number, frame)
 
 
-@dataclass(eq=False)
 class RunCheckpoint(WritingCallback, Checkpoint):
     """Saves the whole state of the run in ``checkpoints/last.ckpt``: regularly, at ends of phases, and when it stops.
 

@@ -4,7 +4,6 @@ import logging
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -31,8 +30,7 @@ log = logging.getLogger(__name__)
 KEPT = 0.7
 
 
-@dataclass(eq=False, kw_only=True)
-class Densification(SplatCallback, ABC):
+class Densification(SplatCallback, ABC, kw_only=True):  # type: ignore[call-arg]  # of dataclass
     """Base of the callbacks that add and remove splats by what the views of the last iterations have shown.
 
     A subclass names its side tables, asks the module for what a view must bring (:meth:`ask`), adds a view to the
@@ -164,7 +162,6 @@ class Densification(SplatCallback, ABC):
         return len(splats) - before
 
 
-@dataclass(eq=False)
 class DensityControl(Densification):
     """Clones, splits and prunes splats (Kerbl et al. 2023, section 5), and drops those that become NaN or infinite.
 

@@ -1,7 +1,6 @@
 """An option beyond the recipe: exposures of photos."""
 
 import logging
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -18,7 +17,6 @@ from .settings import Positive
 log = logging.getLogger(__name__)
 
 
-@dataclass(eq=False)
 class ExposureCompensation(SplatCallback):
     """Gives each train photo an affine map of colours, which is applied to its rendered picture before the loss.
 

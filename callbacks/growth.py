@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Annotated
 
@@ -33,7 +33,6 @@ log = logging.getLogger(__name__)
 MIN_BUDGET = 1000
 
 
-@dataclass(eq=False)
 class SplatBudget(SplatCallback):
     """Decides how many splats the scene is to have, and says why.
 
@@ -120,7 +119,6 @@ def split_longest(parents: RawSplats) -> RawSplats:
 IDLE = 0.01
 
 
-@dataclass(eq=False)
 class BudgetedGrowth(Densification):
     """Splits splats where the photos have edges, up to a budget: fewer splats for the same quality.
 

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from .base import WritingCallback, picture_file
 log = logging.getLogger(__name__)
 
 
-@dataclass(eq=False)
 class ExportScene(WritingCallback):
     """Writes the scene when training ends.
 

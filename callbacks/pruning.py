@@ -1,7 +1,6 @@
 """What removes splats in the prune phase: the penalty on opacities, and their selection."""
 
 import logging
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -19,7 +18,6 @@ from .settings import Count, NonNegative
 log = logging.getLogger(__name__)
 
 
-@dataclass(eq=False)
 class OpacityRegularization(SplatCallback):
     """Adds λ · Σ opacity to the loss during the prune phase, so that unneeded splats fade and are pruned.
 
@@ -54,7 +52,6 @@ class OpacityRegularization(SplatCallback):
 VIEWS = 64
 
 
-@dataclass(eq=False)
 class SplatSelection(SplatCallback):
     """After the warm-up phase, removes the splats that the train views miss least, until a budget is left.
 

@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import torch
@@ -29,7 +29,6 @@ from .settings import Count, Factor, Positive
 log = logging.getLogger(__name__)
 
 
-@dataclass(eq=False)
 class CanonicalCovariance(SplatCallback):
     """After the last iteration before the quantize phase, gives like covariances like scales and rotations.
 
@@ -68,7 +67,6 @@ def perplexity(usage: Tensor) -> float:
     return float(torch.special.entr(usage.double() / usage.sum()).sum().exp()) if usage.any() else 0.0
 
 
-@dataclass(eq=False)
 class CodebookInit(SplatCallback):
     """At the first iteration of the quantize phase, fit every codebook to the rows of all splats (k-means).
 
@@ -121,7 +119,6 @@ class CodebookInit(SplatCallback):
             log.info(f"iteration {iteration}: codebooks for {len(module.splats)} splats: {sizes}")
 
 
-@dataclass(eq=False)
 class CodebookReplacement(SplatCallback):
     """Replaces inactive codes with copies of active ones, at first often, then less often (paper, section 3.2).
 
@@ -213,7 +210,6 @@ def _sum_usage(trainer: Trainer, quantizer: Quantizer) -> None:
         distributed.sum_over_processes(trainer, counter)
 
 
-@dataclass(eq=False)
 class CodebookRefit(SplatCallback):
     """Refits codebooks to the rows of all splats in the quantize phase, as CompGS does (Navaneet et al. 2024).
 
@@ -277,7 +273,6 @@ BITS_A_SPLAT = 64
 MIN_SENSITIVITY = 0.05
 
 
-@dataclass(eq=False)
 class RateDistortion(SplatCallback):
     """In the quantize phase, gives every splat the code with the least error + λ · bits instead of the nearest one.
 
@@ -348,7 +343,6 @@ class RateDistortion(SplatCallback):
             quantizer.hold(codes)  # type: ignore[attr-defined]
 
 
-@dataclass(eq=False)
 class FiniteCodes(SplatCallback):
     """Searches codebooks for NaN and infinite values, from the quantize phase on, and mends such codes with a warning.
 
@@ -381,7 +375,6 @@ class FiniteCodes(SplatCallback):
             log.warning(f"{found} (rows {rows}); mended")
 
 
-@dataclass(eq=False)
 class FreezeCodes(SplatCallback):
     """At the first iteration of fine-tuning, freezes the code of every splat: the one it holds, or else the nearest.
 

@@ -1,7 +1,6 @@
 """Measure the run: curves while it trains, and the quality of the decoded file at the end."""
 
 import logging
-from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
@@ -44,7 +43,6 @@ def notify_monitors(trainer: Trainer, module: SplatModule) -> None:
             watcher.on_validation_end(trainer, module)
 
 
-@dataclass(eq=False)
 class MetricReport(WritingCallback):
     """Writes the results of a run to its folder.
 

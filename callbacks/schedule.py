@@ -1,7 +1,7 @@
 """What follows the iteration alone: the phase, the degree of the spherical harmonics, falling learning rates."""
 
 import logging
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from typing import Any
 
 from lightning.pytorch import Trainer
@@ -20,7 +20,6 @@ log = logging.getLogger(__name__)
 MIN_ITERATIONS = 1500
 
 
-@dataclass(eq=False)
 class PhaseSchedule(SplatCallback):
     """Gives the module its schedule, and the phase of each iteration.
 
@@ -185,7 +184,6 @@ class PhaseSchedule(SplatCallback):
         super().on_train_batch_start(trainer, module, *args)
 
 
-@dataclass(eq=False)
 class ShDegreeSchedule(SplatCallback):
     """Starts with SH degree 0 and adds one at intervals, up to the degree of the splats.
 
@@ -207,7 +205,6 @@ class ShDegreeSchedule(SplatCallback):
         module.active_sh_degree = max(degree, module.active_sh_degree)
 
 
-@dataclass(eq=False)
 class LearningRateDecay(SplatCallback):
     """Lets all learning rates but that of the positions, which have their own, fall in the last iterations of a run.
 
