@@ -1,6 +1,5 @@
 """Checkpoints of a run: regularly, and when a signal asks for a stop."""
 
-import logging
 import signal
 from contextlib import nullcontext
 from pathlib import Path
@@ -13,14 +12,13 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
 from nsvq_lightning.io.atomic import atomic_path, make_folder_of
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 
 from .base import WritingCallback
 from .settings import Whole
-
-log = logging.getLogger(__name__)
 
 HELD = (signal.SIGINT, signal.SIGTERM)
 # Steps between two exchanges of signals among several GPUs.

@@ -1,6 +1,5 @@
 """Adaptive density control of the warm-up and prune phases (Kerbl et al. 2023, section 5), and the base of its kind."""
 
-import logging
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -16,14 +15,13 @@ from nsvq_lightning.random import draw_rows, generator, top_rows
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices
 from nsvq_lightning.splats.splats import RawSplats, detached, times_vectors
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training import distributed, row_ops, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
 
 from .base import SplatCallback, finite_search_is_due, keep_finite_splats
 from .settings import Count, NonNegative, Opacity, Positive, Whole
-
-log = logging.getLogger(__name__)
 
 # Share of the limit that is left where a run starts with more points, or with more splats than the limit. The others
 # are added where they are missed: all that the limit allows, those that contribute most, were 1 dB worse.
@@ -260,8 +258,8 @@ class DensityControl(Densification):
         elif due:
             pruned = self._prune(module, huge=False)
             distributed.check_replicas(trainer, "pruning")
-            level = logging.INFO if pruned else logging.DEBUG
-            log.log(level, f"iteration {iteration}: pruned {pruned} splats, {len(module.splats)} remain")
+            say = log.info if pruned else log.debug
+            say(f"iteration {iteration}: pruned {pruned} splats, {len(module.splats)} remain")
         on_white = module.background == "white" and self.white_reset > 0
         first = on_white and iteration == schedule.iteration(self.white_reset)
         if growing and (first or iteration in schedule.reset_times(self.reset_last, self.reset_every)):

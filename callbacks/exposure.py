@@ -1,6 +1,5 @@
 """An option beyond the recipe: exposures of photos."""
 
-import logging
 from typing import Any
 
 import torch
@@ -8,13 +7,12 @@ from lightning.pytorch import Trainer
 
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.rendering.rasterize import Render
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training import distributed, run_scene
 from nsvq_lightning.training.module import LossTerm, SplatModule
 
 from .base import SplatCallback, has_gradients
 from .settings import Positive
-
-log = logging.getLogger(__name__)
 
 
 class ExposureCompensation(SplatCallback):

@@ -1,6 +1,5 @@
 """Density control with a budget: how many splats there are to be, and splits where the photos have edges."""
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,6 +18,7 @@ from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.reference import rotation_matrices
 from nsvq_lightning.splats.attributes import QUANTIZABLE, attribute_dims, codebook_bits
 from nsvq_lightning.splats.splats import RawSplats, detached, times_vectors
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training import distributed, run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, Schedule
@@ -26,8 +26,6 @@ from nsvq_lightning.training.schedule import Phase, Schedule
 from .base import SplatCallback
 from .density import KEPT, Densification, reset_opacities
 from .settings import AT_LEAST_1, Count, NonNegative, Opacity, Positive, Share, Whole
-
-log = logging.getLogger(__name__)
 
 # Fewest splats of a scene.
 MIN_BUDGET = 1000

@@ -1,6 +1,5 @@
 """What a run writes besides its report: scene files, predicted pictures, and the scene to look at while it trains."""
 
-import logging
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,13 +17,12 @@ from nsvq_lightning.io.nsvq.file import as_stored
 from nsvq_lightning.io.placing import placed
 from nsvq_lightning.rendering.camera_paths import CAMERAS
 from nsvq_lightning.report import pictures, viewer
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 from nsvq_lightning.training.run_scene import scene_of
 
 from .base import WritingCallback, picture_file
-
-log = logging.getLogger(__name__)
 
 
 class ExportScene(WritingCallback):

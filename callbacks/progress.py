@@ -1,6 +1,5 @@
 """The progress of a whole run: a bar on a terminal, plain lines in a file."""
 
-import logging
 import sys
 import time
 from io import StringIO
@@ -11,9 +10,9 @@ from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.callbacks.progress.tqdm_progress import Tqdm
 
 from nsvq_lightning.compute.jit import compile_seconds
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training.module import SplatModule
 
-log = logging.getLogger(__name__)
 # Lines of a run if the output is not a terminal.
 LINES = 50
 # Weight of the past in the exponential mean of the training PSNR.

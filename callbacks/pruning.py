@@ -1,12 +1,12 @@
 """What removes splats in the prune phase: the penalty on opacities, and their selection."""
 
-import logging
 from typing import Any
 
 import torch
 from lightning.pytorch import Trainer
 
 from nsvq_lightning.random import top_rows
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training import distributed, row_ops, run_scene
 from nsvq_lightning.training.importance import below_cap, likely_effects
 from nsvq_lightning.training.module import SplatModule
@@ -14,8 +14,6 @@ from nsvq_lightning.training.schedule import Phase
 
 from .base import SplatCallback
 from .settings import Count, NonNegative
-
-log = logging.getLogger(__name__)
 
 
 class OpacityRegularization(SplatCallback):

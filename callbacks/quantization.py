@@ -1,6 +1,5 @@
 """What the quantize and fine-tune phases do to codebooks and codes: place, refit, replace, mend, freeze."""
 
-import logging
 import math
 from collections.abc import Iterable
 from dataclasses import field
@@ -18,6 +17,7 @@ from nsvq_lightning.quantize.codebook import Quantizer, held_codes
 from nsvq_lightning.quantize.nearest import cheapest, code_rates
 from nsvq_lightning.random import generator
 from nsvq_lightning.splats.splats import canonical
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training import distributed, optim, row_ops, run_scene
 from nsvq_lightning.training.importance import row_weights
 from nsvq_lightning.training.module import SplatModule
@@ -25,8 +25,6 @@ from nsvq_lightning.training.schedule import Phase
 
 from .base import SplatCallback, finite_search_is_due, first_time, keep_finite_splats
 from .settings import Count, Factor, Positive
-
-log = logging.getLogger(__name__)
 
 
 class CanonicalCovariance(SplatCallback):

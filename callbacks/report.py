@@ -1,6 +1,5 @@
 """Measure the run: curves while it trains, and the quality of the decoded file at the end."""
 
-import logging
 from statistics import fmean
 from typing import Any
 
@@ -19,6 +18,7 @@ from nsvq_lightning.io.nsvq.file import paper_header, read_nsvq
 from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
 from nsvq_lightning.report import numbers, page, pictures
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 from nsvq_lightning.training.run_scene import scene_of
@@ -26,8 +26,6 @@ from nsvq_lightning.training.stopwatch import TimesBeside
 
 from .base import WritingCallback, picture_file
 from .settings import Whole
-
-log = logging.getLogger(__name__)
 
 
 def notify_monitors(trainer: Trainer, module: SplatModule) -> None:

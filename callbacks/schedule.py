@@ -1,11 +1,11 @@
 """What follows the iteration alone: the phase, the degree of the spherical harmonics, falling learning rates."""
 
-import logging
 from dataclasses import field, fields
 from typing import Any
 
 from lightning.pytorch import Trainer
 
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training import run_scene
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase, Schedule
@@ -13,8 +13,6 @@ from nsvq_lightning.training.schedule import Phase, Schedule
 from .base import SplatCallback
 from .forecast import iterations_within
 from .settings import Count, Factor, Positive, Whole
-
-log = logging.getLogger(__name__)
 
 # Below so many, every minute more, or smaller photos, makes a scene visibly better.
 MIN_ITERATIONS = 1500

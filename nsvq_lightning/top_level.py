@@ -1,9 +1,10 @@
-"""Folders of the package that stand at the top level of the repository.
+"""What the package has at its top level: its logger, and folders that stand beside it in the repository.
 
-An installed package contains them, and in a checkout, symbolic links lead to them. Where git cannot create links, as on
-Windows, it writes small text files instead; this module then finds the folders at the top level.
+An installed package contains these folders, and in a checkout, symbolic links lead to them. Where git cannot create
+links, as on Windows, it writes small text files instead; this module then finds the folders at the top level.
 """
 
+import logging
 import sys
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
@@ -11,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+log = logging.getLogger("nsvq_lightning")
 _PACKAGE = Path(__file__).parent
 
 

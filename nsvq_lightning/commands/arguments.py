@@ -1,6 +1,5 @@
 """What the arguments of commands stand for: lists, numbers, and scenes with the photos behind them."""
 
-import logging
 import math
 import os
 import re
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from nsvq_lightning.commands import nearest
 from nsvq_lightning.commands.settings import check_config
+from nsvq_lightning.top_level import log
 
 if TYPE_CHECKING:
     from nsvq_lightning.data.scene import Scene
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 
     # Cameras by the names of their photos, and these.
     Views = tuple[dict[str, Camera], Scene | None]
-
-
-log = logging.getLogger(__name__)
 
 
 class Parser(ArgumentParser):

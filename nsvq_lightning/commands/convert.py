@@ -11,7 +11,6 @@ Examples:
   nsvq convert scene.nsvq clean.nsvq --floaters --up z --data.root my/scene
 """
 
-import logging
 from argparse import ArgumentError, ArgumentParser, Namespace
 from functools import partial
 from pathlib import Path
@@ -27,6 +26,7 @@ from nsvq_lightning.io.compressed import CompressedScene, on_white, renderer
 from nsvq_lightning.io.nsvq.precision import LEVELS
 from nsvq_lightning.io.sog import PALETTE_LIMIT
 from nsvq_lightning.splats.conventions import Float64s
+from nsvq_lightning.top_level import log
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -84,7 +84,7 @@ def run(options: Namespace) -> int:
     say(f"{output}: {len(scene):,} splats in {size:,} bytes, {size / len(scene):.1f} per splat")
     if options.measure:
         # What reading the files again would say of them is known here.
-        logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
+        log.setLevel("WARNING")
         _measure(options.inputs[0], output, options.root)
     return 0
 

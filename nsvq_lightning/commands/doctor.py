@@ -8,7 +8,6 @@ Examples:
   nsvq doctor path/to/scene > doctor.txt
 """
 
-import logging
 import os
 import platform
 import re
@@ -25,6 +24,7 @@ import numpy as np
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.settings import check_config, find_config
+from nsvq_lightning.top_level import log
 
 # Each check imports what it needs: --help answers at once, and a package that is missing or broken fails only the
 # checks that need it.
@@ -44,7 +44,7 @@ def run(options: Namespace) -> int:
     Returns:
         0, or 1 if there is a problem: the self-test fails or the folder cannot be used.
     """
-    logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
+    log.setLevel("WARNING")
     counts = shown(check_all(options.folder))
     problems, notes = counts["problem"], counts["note"]
     say(f"\n{problems or 'no'} problem{'s' * (problems != 1)}, {notes or 'no'} note{'s' * (notes != 1)}")

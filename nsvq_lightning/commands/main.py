@@ -19,6 +19,7 @@ from typing import Any, TextIO
 from nsvq_lightning.commands import COMMANDS, OF_LIGHTNING, nearest, overview, say
 from nsvq_lightning.commands.arguments import Parser
 from nsvq_lightning.commands.settings import FIT_HELP, check_early, configs_among, expand
+from nsvq_lightning.top_level import log
 from nsvq_lightning.version import __version__
 
 # Environment variable that makes errors show their traceback.
@@ -248,7 +249,7 @@ class BarHandler(logging.StreamHandler[TextIO]):
 def _show_log() -> None:
     """Show our log messages."""
     logging.basicConfig(format="%(message)s", handlers=[BarHandler()])
-    logging.getLogger("nsvq_lightning").setLevel(logging.INFO)
+    log.setLevel("INFO")
 
 
 def _quiet_lightning() -> None:

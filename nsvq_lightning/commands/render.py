@@ -10,7 +10,6 @@ Examples:
   nsvq render scene.nsvq --data.root scenes/fox --path cameras -o frames/
 """
 
-import logging
 import math
 import re
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
@@ -23,12 +22,11 @@ from tqdm import tqdm
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import add_root, positive, scene_file, scene_with_views
+from nsvq_lightning.top_level import log
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.camera import Camera
     from nsvq_lightning.splats.splats import Splats
-
-log = logging.getLogger(__name__)
 
 FPS = 24.0
 SECONDS = 10.0

@@ -9,7 +9,6 @@ Examples:
 """
 
 import json
-import logging
 import re
 import shlex
 import signal
@@ -32,9 +31,8 @@ from nsvq_lightning.commands import markdown_table, say
 from nsvq_lightning.commands.arguments import integers, names, positive
 from nsvq_lightning.commands.settings import expand
 from nsvq_lightning.io.atomic import write_text
+from nsvq_lightning.top_level import log
 from nsvq_lightning.version import __version__
-
-log = logging.getLogger(__name__)
 
 # What a line of ``results.csv`` says, by column.
 Row = dict[str, Any]

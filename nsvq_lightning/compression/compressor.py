@@ -33,13 +33,12 @@ from nsvq_lightning.rendering.sampling import trained_by
 from nsvq_lightning.report.numbers import evaluate
 from nsvq_lightning.splats import attributes
 from nsvq_lightning.splats.splats import SplatTensors
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training import importance
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.training.trainer import SplatTrainer
-
-log = logging.getLogger(__name__)
 
 
 class Setting(NamedTuple):

@@ -5,7 +5,6 @@ from step to step, such as that of the splats in view, are named in ``do_not_spe
 the middle of a run.
 """
 
-import logging
 import os
 from functools import cache
 from importlib.util import find_spec
@@ -15,7 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 # Options of every launch. Triton's default is about to change; values on which the forward and backward pass must
 # agree to the bit are computed with an explicit ``fma``.

@@ -4,7 +4,6 @@ A kernel is compiled at its first call on a machine and read from the disk cache
 training, so clocks leave it out.
 """
 
-import logging
 import os
 from collections.abc import Callable
 from contextlib import suppress
@@ -22,8 +21,7 @@ from numba.core import cgutils, event
 from numba.extending import intrinsic
 
 from nsvq_lightning.compute import kernel_cache
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 # What this module has made; a user's own functions are none of its business.
 _ours: WeakSet[Any] = WeakSet()

@@ -5,7 +5,6 @@ changes: too late, since a kernel contains the code of its helpers and constants
 still Numba's own, lie in a folder named after a digest of the sources of a kernel's module and of all that it imports.
 """
 
-import logging
 import re
 import sys
 from functools import cache
@@ -22,7 +21,7 @@ from filelock import FileLock, Timeout
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.misc.appdirs import AppDirs
 
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 
 @cache

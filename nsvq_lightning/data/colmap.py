@@ -3,7 +3,6 @@
 The only place that imports pycolmap.
 """
 
-import logging
 import math
 from collections.abc import Callable, Iterable, Sequence, Sized
 from contextlib import suppress
@@ -20,8 +19,7 @@ from scipy.spatial.transform import Rotation
 from nsvq_lightning.data import NO_FOLDER
 from nsvq_lightning.data import colmap_tables as tables
 from nsvq_lightning.splats.conventions import Float64s, Int64s, Uint8s, white_of
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 # Upper bound on poses and intrinsics: their squares, which rendering computes in float32, stay finite.
 MAX_NUMBER = 1e18

@@ -1,6 +1,5 @@
 """Where the photos and masks of a scene are: under the names that its model gives, or under the nearest ones."""
 
-import logging
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -9,8 +8,7 @@ from pathlib import Path, PurePosixPath
 from unicodedata import normalize
 
 from nsvq_lightning.data.colmap import ColmapImage, NoPhotosError, SceneError, check_name, is_outside
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 # Suffixes of photos that both COLMAP and this package read.
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")

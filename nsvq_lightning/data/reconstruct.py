@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import logging
 import os
 import re
 import sqlite3
@@ -29,8 +28,7 @@ from nsvq_lightning.data.images import DAMAGED, ImageHead, read_image
 from nsvq_lightning.data.photo_files import PHOTOS, photos_below
 from nsvq_lightning.data.scene import spread
 from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 # Photos that are named; of the others, their number is.
 MAX_NAMED = 8

@@ -1,6 +1,5 @@
 """A scene: registered views with pinhole cameras, sparse points, the split into train and test, and photos' detail."""
 
-import logging
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -30,8 +29,7 @@ from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
 from nsvq_lightning.splats.conventions import ZERO, Bools, Float32s, Float64s, Place
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 T = TypeVar("T")
 

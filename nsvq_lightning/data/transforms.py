@@ -4,7 +4,6 @@ The file has the cameras; the points to start from are those of a ``.ply`` file,
 """
 
 import json
-import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,8 +22,7 @@ from nsvq_lightning.io.errors import Json
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.poses import transformed, viewmat_of
 from nsvq_lightning.splats.conventions import Float64s, Uint8s
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 # A camera: COLMAP's name of the model, width and height in pixels, parameters.
 _Lens = tuple[str, int, int, tuple[float, ...]]

@@ -1,6 +1,5 @@
 """Photos of a camera with distortion, as a pinhole camera would have taken them."""
 
-import logging
 from typing import Any
 
 import cv2
@@ -9,8 +8,7 @@ import numpy as np
 from nsvq_lightning.data import PANORAMA
 from nsvq_lightning.data.colmap import Pinhole, SceneError, import_pycolmap
 from nsvq_lightning.splats.conventions import Bools, Float32s, Uint8s
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 
 def rectify(camera: Any, width: int, height: int, keep_maps: bool = True) -> "tuple[Pinhole, Undistortion | None]":

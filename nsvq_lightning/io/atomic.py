@@ -1,6 +1,5 @@
 """Files that are either complete or absent."""
 
-import logging
 import os
 import secrets
 from collections.abc import Iterator
@@ -8,7 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 StrPath = str | os.PathLike[str]
 

@@ -1,6 +1,5 @@
 """A scene as files hold it: some of its attributes are codes, which most changes leave as they are."""
 
-import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,6 +13,7 @@ from nsvq_lightning.rendering.sampling import MAX_CAMERAS, Sampling, fewer_camer
 from nsvq_lightning.splats import attributes as splat
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.conventions import ZERO, Arrays, Bools, Float32s, Float64s, Integers, Place, shN_degree
+from nsvq_lightning.top_level import log
 
 if TYPE_CHECKING:
     from torch.nn import Module
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors
 
 AnySplats: TypeAlias = "CompressedScene | SplatTensors | Mapping[str, Any] | Module"
-
-log = logging.getLogger(__name__)
 
 # Attributes by their names here and in nerfstudio.
 NAMES = {name: name for name in splat.ATTRIBUTES} | {"features_dc": "sh0", "features_rest": "shN"}

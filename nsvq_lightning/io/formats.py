@@ -1,6 +1,5 @@
 """Scene files of any format: the end of the file's name selects it."""
 
-import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +14,10 @@ from nsvq_lightning.io.errors import Json, naming_file
 from nsvq_lightning.io.nsvq.file import as_stored, read_nsvq, write_nsvq
 from nsvq_lightning.io.nsvq.header import describe_nsvq
 from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.top_level import log
 
 if TYPE_CHECKING:
     from nsvq_lightning.splats.splats import Splats
-
-logger = logging.getLogger(__name__)
 
 
 class Format(NamedTuple):
@@ -53,7 +51,7 @@ def load(path: StrPath) -> "Splats":
     scene = read_scene(path)
     if any((*scene.origin, *scene.background, scene.antialiased)):
         facts = f"origin {scene.origin}, background {scene.background}, antialiased {scene.antialiased}"
-        logger.warning(f"{path}: its splats alone do not say {facts}: nsvq_lightning.io.read_scene does")
+        log.warning(f"{path}: its splats alone do not say {facts}: nsvq_lightning.io.read_scene does")
     return scene.decode()
 
 
@@ -64,7 +62,7 @@ def read_scene(path: StrPath) -> CompressedScene:
     with naming_file(path):
         kept = scene.finite()
     if unturned := len(kept) - np.count_nonzero(kept.rows("quats").any(axis=1)):
-        logger.warning(f"{path}: {unturned} of {len(kept)} splats have the rotation 0 0 0 0: not turned")
+        log.warning(f"{path}: {unturned} of {len(kept)} splats have the rotation 0 0 0 0: not turned")
     return replace(kept, stored_bytes=scene.stored_bytes or path.stat().st_size)
 
 
@@ -101,7 +99,7 @@ def save(scene: AnySplats, path: StrPath, storage: Storage | str | None = None, 
         lost = {"origin": scene.origin} | lost
     if any(map(any, lost.values())) and not entry.native:
         told = ", ".join(f"{name} {value}" for name, value in lost.items())
-        logger.warning(f"{path}: not stored: {told}; set in the viewer")
+        log.warning(f"{path}: not stored: {told}; set in the viewer")
     storage = None if storage is None else Storage.of(storage)
     if entry.native:
         options["storage"] = storage

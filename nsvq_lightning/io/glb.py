@@ -6,7 +6,6 @@ colours for each spherical harmonic. glTF has y up: our right, down, front turne
 """
 
 import json
-import logging
 from collections.abc import Iterator
 from pathlib import Path
 from struct import Struct
@@ -19,8 +18,7 @@ from nsvq_lightning.io.errors import STRANGE, FormatError, Json, check_room, che
 from nsvq_lightning.io.numbers import finite_logs, logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, moved, rotated
 from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s, sh_coefficients, unit
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 EXTENSION = "KHR_gaussian_splatting"
 OPACITY = f"{EXTENSION}:OPACITY"

@@ -1,6 +1,5 @@
 """Numbers in few bits: opacities as bytes, values clamped to a range, powers of two."""
 
-import logging
 import math
 from collections import Counter
 from typing import Any
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.io.errors import Bytes
 from nsvq_lightning.splats.conventions import Float32s, Float64s, Int32s, Uint8s
+from nsvq_lightning.top_level import log
 
 # Logarithm that stands for that of an axis length of 0, which discs have: too thin to show, and not beyond any format's
 # range by more than it must be.
@@ -60,8 +60,6 @@ def logs_of_lengths(lengths: Float32s) -> Float32s:
     return logs
 
 
-logger = logging.getLogger(__name__)
-
 # What float32 rounding may add to a distance of one half.
 _ROUNDING = 1e-3
 
@@ -87,7 +85,7 @@ class Clamped(Counter[str]):
     def warn(self, path: StrPath, count: int) -> None:
         """Warn how many of ``count`` splats were clamped to the format's range."""
         if changed := ", ".join(f"{name} {splats}" for name, splats in self.items() if splats):
-            logger.warning(f"{path}: out of the range of its format, clamped to it: {changed} (of {count} splats)")
+            log.warning(f"{path}: out of the range of its format, clamped to it: {changed} (of {count} splats)")
 
 
 def float_rows(data: Bytes, rows: int, dim: int) -> Float32s:

@@ -1,6 +1,5 @@
 """The ``.ply`` of 3D Gaussian Splatting, which every viewer reads (Kerbl et al. 2023, the authors' layout)."""
 
-import logging
 import math
 import os
 import re
@@ -20,8 +19,7 @@ from nsvq_lightning.io.placing import FAR
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
 from nsvq_lightning.splats.conventions import SH_C0, ZERO, Arrays, Float32s, Float64s, Place, white_of
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 _TYPES = {

@@ -20,7 +20,6 @@ depends only on the decoded splats: a scene gives the same file with its codeboo
 """
 
 import json
-import logging
 import math
 import re
 import struct
@@ -40,8 +39,7 @@ from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, Json, check_room, 
 from nsvq_lightning.io.numbers import bytes_of, logits_of_bytes, opacity_of
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, Int64s, Integers, Uint8s, sh_coefficients
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 META = "meta.json"
 # Number of rows that a 16-bit label can address.

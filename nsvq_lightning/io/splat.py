@@ -10,7 +10,6 @@ offset     bytes  content
 =========  =====  ====================================================================
 """
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +20,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.numbers import Clamped, bytes_of, logits_of_bytes, logs_of_lengths
 from nsvq_lightning.splats.conventions import SH_C0, unit
-
-logger = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 _RECORD = np.dtype([("means", "<f4", 3), ("lengths", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
 
@@ -37,10 +35,10 @@ def write_splat(path: StrPath, scene: CompressedScene) -> int:
         Bytes of the file.
     """
     if scene.sh_degree:
-        logger.warning(f"{path}: .splat files hold no spherical harmonics; colours no longer change with the view")
+        log.warning(f"{path}: .splat files hold no spherical harmonics; colours no longer change with the view")
     if scene.antialiased:
         advice = "switch it on in the viewer, or small splats look too thick"
-        logger.warning(f"{path}: the file cannot say that the scene was trained with anti-aliasing: {advice}")
+        log.warning(f"{path}: the file cannot say that the scene was trained with anti-aliasing: {advice}")
     clamped = Clamped()
     records = np.concatenate([_records(part, clamped) for part in scene.parts()])
     clamped.warn(path, len(scene))

@@ -29,7 +29,6 @@ In version 4, the header is followed by the offset of a table, 12 zero bytes, ex
 stream for each array that is not empty.
 """
 
-import logging
 import math
 import zlib
 from collections.abc import Mapping
@@ -52,8 +51,7 @@ from nsvq_lightning.io.placing import UP_AXES, rotated
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import QUANTIZABLE
 from nsvq_lightning.splats.conventions import Arrays, Float32s, Uint8s, Uint32s
-
-logger = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 _MAGIC, _GZIP = b"NGSP", b"\x1f\x8b"
 # Magic, version, N, SH degree, fractional bits, flags, and number of streams (0 up to version 3).
@@ -261,7 +259,7 @@ def _parse(start: bytes, file_bytes: int) -> SpzHeader:
     check_room("splats", count, file_bytes)
     header = SpzHeader(version, count, sh_degree, fraction_bits, flags)
     if strange := flags & ~(ANTIALIASED | _EXTENDED | (_LEVELS if header.sizes["tree"] else 0)):
-        logger.warning(f"unknown flags 0x{strange:02x} of .spz")
+        log.warning(f"unknown flags 0x{strange:02x} of .spz")
     return header
 
 
@@ -333,7 +331,7 @@ def write_spz(
     }
     clamped.warn(path, len(scene))
     if fraction * math.log(2) < -np.median(scene.rows("scales")):
-        logger.warning(f"{path}: positions are rounded by half a splat, as they are far from 0: move them there first")
+        log.warning(f"{path}: positions are rounded by half a splat, as they are far from 0: move them there first")
     flags = ANTIALIASED * scene.antialiased
     return _write_frame(path, SpzHeader(version, len(scene), scene.sh_degree, fraction, flags, stated), arrays)
 
@@ -384,10 +382,10 @@ def read_spz(path: StrPath) -> CompressedScene:
     }
     if not header.system:
         advice = "If it is upside down: nsvq convert --up minus-y --up-from 0 1 0"
-        logger.info(f"{path}: the file does not say where its axes point; taken as right, down, front. {advice}")
+        log.info(f"{path}: the file does not say where its axes point; taken as right, down, front. {advice}")
     degree = min(header.sh_degree, 3)
     if header.sh_degree > degree:
-        logger.warning(f"{path}: of SH degree {header.sh_degree}, degrees up to {degree} are read")
+        log.warning(f"{path}: of SH degree {header.sh_degree}, degrees up to {degree} are read")
     factor = 2 if arrays["tree"].size else 1  # a splat that stands for several may be above 1
     levels = np.minimum(arrays["opacities"].astype(np.uint16) * factor, 255).astype(np.uint8)
     system = header.system or _SYSTEMS.index(DEFAULT_AXES) + 1
@@ -408,7 +406,7 @@ def read_spz(path: StrPath) -> CompressedScene:
     )
     if arrays["tree"].size:
         scene = scene.take(np.flatnonzero(arrays["tree"].ravel()[: 2 * header.count].view("<u2") == 0))
-        logger.info(f"{path}: levels of detail; the finest is read, {len(scene)} of {header.count} splats")
+        log.info(f"{path}: levels of detail; the finest is read, {len(scene)} of {header.count} splats")
     # Signs first, then the turn, as Niantic's library does it, which writes such files.
     return rotated(scene, UP_AXES["z"]) if system > 8 else scene
 

@@ -3,7 +3,6 @@
 It has y up: our right, down, front turned half around z.
 """
 
-import logging
 import re
 from pathlib import Path
 
@@ -15,8 +14,7 @@ from nsvq_lightning.io.errors import FormatError, check_start, naming_file
 from nsvq_lightning.io.numbers import logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, UP_AXES, rotated
 from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, sh_coefficients, unit
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 _ROWS = 1 << 12
 BINARY_REMEDY = "write it as text: usdcat -o scene.usda FILE"

@@ -1,6 +1,5 @@
 """What callbacks expect of a quantizer, and the base of those here: a codebook from its placement to the file."""
 
-import logging
 from abc import ABC, abstractmethod
 from typing import Any, Literal, Protocol, cast
 
@@ -13,6 +12,7 @@ from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.quantize.tracking import NearestTracker
 from nsvq_lightning.random import generator as seeded
 from nsvq_lightning.skips import is_on
+from nsvq_lightning.top_level import log
 
 # Rows as they are rendered ``[V, D]``, and their codes ``[V]``.
 Quantized = tuple[Tensor, Tensor]
@@ -50,9 +50,6 @@ def split_codes(active: Tensor, rows: Tensor, count: int, jitter: float, generat
     """
     far = rows[draw_far_rows(rows, active, count, generator)]
     return active[nearest(far, active)].lerp(far, jitter)
-
-
-_log = logging.getLogger(__name__)
 
 
 class CodebookQuantizer(nn.Module, ABC):
@@ -228,7 +225,7 @@ class CodebookQuantizer(nn.Module, ABC):
         replaced = (inactive & finite).nonzero()[:, 0]
         active = self.codebook[~inactive & finite]
         if len(active) == 0 < len(replaced):
-            _log.warning(f"no code was active in {int(self.window)} iterations; the codebook is left as it is")
+            log.warning(f"no code was active in {int(self.window)} iterations; the codebook is left as it is")
             replaced = replaced[:0]
         if len(replaced) > 0:
             if rows is None:

@@ -1,6 +1,5 @@
 """What a run shows: pictures of its views, and videos, under names that every file system has."""
 
-import logging
 import os
 import re
 import shutil
@@ -24,8 +23,7 @@ from torch import Tensor
 from nsvq_lightning.data.images import read_image, write_pixels
 from nsvq_lightning.io.atomic import atomic_path, make_folder_of
 from nsvq_lightning.splats.conventions import Uint8s
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 # Bytes of a file name without suffix; file systems take 143 to 255 with it.
 LONGEST = 120

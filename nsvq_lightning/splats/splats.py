@@ -1,6 +1,5 @@
 """The scene: six raw attributes of N Gaussian splats, and the canonical form of their covariances."""
 
-import logging
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -11,8 +10,7 @@ from torch import Tensor, nn
 
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM, SH_C0, sh_coefficients, shN_degree
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 
 class RawSplats(NamedTuple):

@@ -1,6 +1,5 @@
 """Training on several devices: one view each, equal replicas, and what they exchange."""
 
-import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
@@ -13,9 +12,8 @@ from torch import Tensor, nn
 from torch.distributed import all_reduce
 
 from nsvq_lightning.compute.devices import to_device
+from nsvq_lightning.top_level import log
 from nsvq_lightning.version import check_replaced
-
-log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 

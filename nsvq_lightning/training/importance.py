@@ -1,6 +1,5 @@
 """How much each splat matters to the pictures: its weight, the effect of its attributes and of its removal."""
 
-import logging
 from collections.abc import Callable, Iterable
 
 import numpy as np
@@ -16,8 +15,7 @@ from nsvq_lightning.rendering.constants import ALPHA_MAX
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.rendering.sh import C0
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
-
-log = logging.getLogger(__name__)
+from nsvq_lightning.top_level import log
 
 # The rasterizer with its settings.
 Renderer = Callable[[SplatTensors, Camera], Render]

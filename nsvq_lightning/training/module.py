@@ -1,6 +1,5 @@
 """The Lightning module: one step of training; what happens at certain steps is left to callbacks."""
 
-import logging
 import math
 import os
 from collections.abc import Callable, Mapping
@@ -32,13 +31,12 @@ from nsvq_lightning.rendering.frame import Frame
 from nsvq_lightning.rendering.rasterize import Render, visible
 from nsvq_lightning.rendering.sampling import trained_by
 from nsvq_lightning.splats.splats import Splats, SplatTensors, detached
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training import distributed, optim, resume, run_scene
 from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.training.self_check import check_device
 from nsvq_lightning.training.splat_scene import SplatScene
 from nsvq_lightning.training.stopwatch import Stopwatch
-
-log = logging.getLogger(__name__)
 
 # A term of the loss ``[]``, from the rendering of a train view and the view.
 LossTerm = Callable[[Render, View], Tensor]

@@ -1,6 +1,5 @@
 """Checkpoints that continue a run: read, checked, and never trusted to import anything."""
 
-import logging
 import re
 import shlex
 import sys
@@ -23,9 +22,8 @@ from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import StrPath, make_folder_of, write_bytes
 from nsvq_lightning.io.errors import FormatError, Json
 from nsvq_lightning.splats.splats import sh_degree_of
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training.schedule import Schedule
-
-log = logging.getLogger(__name__)
 
 # Of a checkpoint, or of a part of one, by their names.
 Values = Mapping[str, Any]

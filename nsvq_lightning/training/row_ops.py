@@ -5,7 +5,6 @@ new ``nn.Parameter`` objects are bound in the module, in their parameter group (
 the optimiser. The step count of Adam belongs to the parameter, not to a row, and is kept.
 """
 
-import logging
 from collections.abc import Callable, Iterable, Iterator
 
 import torch
@@ -14,9 +13,8 @@ from torch.optim import Optimizer
 
 from nsvq_lightning.splats.attributes import ATTRIBUTES, dropped, finite_rows, listed
 from nsvq_lightning.splats.splats import RawSplats, Splats, check_shapes, times_vectors
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training.optim import find_group
-
-log = logging.getLogger(__name__)
 
 # Up to here (8e13 scene units) float32 holds the square of a splat's extent on the near plane of any camera; no view
 # shows larger splats, so nothing would ever train or prune them.

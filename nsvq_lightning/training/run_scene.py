@@ -1,6 +1,5 @@
 """What a run takes from its scene: extent, background, first splats, how much each splat shows in the train views."""
 
-import logging
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -21,11 +20,10 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.importance import contributions, sensitivity
 from nsvq_lightning.training.splat_scene import SplatScene
-
-log = logging.getLogger(__name__)
 
 # First splats of a run with a budget (docs/recipe.md): opacity; largest size in pixels of the nearest photo, as a lone
 # point would hide what is behind it; and most points of those that there are, as a multiple of those to start with.

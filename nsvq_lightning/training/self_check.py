@@ -1,6 +1,5 @@
 """Whether the kernels of a device compute what they should: each against the definition, on a tiny scene."""
 
-import logging
 import os
 
 import torch
@@ -19,9 +18,8 @@ from nsvq_lightning.rendering.camera import camera_of
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.splats.attributes import attribute_shapes
 from nsvq_lightning.splats.splats import RawSplats
+from nsvq_lightning.top_level import log
 from nsvq_lightning.version import __version__
-
-log = logging.getLogger(__name__)
 
 # Largest relative error of sound kernels: rounding stays below 1e-4, but a splat that crosses α = 1/255 costs more.
 TOLERANCE = 1e-3

@@ -1,6 +1,5 @@
 """What a run has made of its scene so far: splats and codebooks, how they are rendered, and how they are stored."""
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,10 +17,9 @@ from nsvq_lightning.rendering.rasterize import Render, render
 from nsvq_lightning.splats.attributes import QUANTIZABLE, dropped, finite_rows
 from nsvq_lightning.splats.conventions import Arrays, Float64s
 from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, detached, sh_degree_of
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.version import __version__
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

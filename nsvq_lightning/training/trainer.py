@@ -1,6 +1,5 @@
 """Lightning's trainer with the defaults, devices and strategies that train splats."""
 
-import logging
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,9 @@ from lightning.pytorch.strategies import DDPStrategy
 from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.io.atomic import make_folder_of
 from nsvq_lightning.io.formats import save
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.resume import PlainCheckpointIO, read_checkpoint
-
-log = logging.getLogger(__name__)
-
 
 # What Lightning's trainer has otherwise.
 TRAINER_DEFAULTS: dict[str, Any] = {

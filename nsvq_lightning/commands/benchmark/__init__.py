@@ -14,7 +14,6 @@ Examples:
   nsvq benchmark quantize,codec --scene scene.ply
 """
 
-import logging
 import sys
 import time
 from argparse import ArgumentError, ArgumentParser, Namespace
@@ -23,6 +22,7 @@ from pathlib import Path
 
 from nsvq_lightning.commands.arguments import integers, positive, some_of
 from nsvq_lightning.skips import SKIPS
+from nsvq_lightning.top_level import log
 
 # Modules of this package; each has a function ``run(scope)``, which returns measurements.
 SUITES = ("render", "quantize", "codec", "train")
@@ -81,7 +81,7 @@ def run(options: Namespace) -> int:
 
     given = {name: value for name, value in vars(options).items() if name != "suites" and value is not None}
     scope = Scope(**{**(QUICK if options.quick else {}), **given})
-    logging.getLogger("nsvq_lightning").setLevel(logging.WARNING)
+    log.setLevel("WARNING")
     about = describe_machine()  # as busy as the machine is before
     found = {}
     for name in options.suites:
