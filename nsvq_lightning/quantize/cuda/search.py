@@ -40,6 +40,12 @@ def places(SIZE: tl.constexpr):
 
 
 @triton.jit
+def load_if(pointer, mask):
+    """What a pointer leads to; 0 where the mask is not set."""
+    return tl.load(pointer, mask=mask, other=0)
+
+
+@triton.jit
 def compare(x, at, codebook, num_codes, code_stride, DIM: tl.constexpr, WITH_SECOND: tl.constexpr):
     """Compare rows with all codes ``[DIM, code_stride]``, which are infinite beyond ``num_codes``.
 
@@ -155,7 +161,7 @@ def drift_kernel(codebook, snapshot, squared_drift, num_codes, DIM: tl.constexpr
     squared = tl.zeros([BLOCK], tl.float32)
     for j in range(DIM):
         at = code * DIM + j
-        step = tl.load(codebook + at, mask=inside, other=0.0) - tl.load(snapshot + at, mask=inside, other=0.0)
+        step = load_if(codebook + at, inside) - load_if(snapshot + at, inside)
         squared = tl.fma(step, step, squared)
     # A code that is not a number may have been anywhere. The largest is the same in whatever order programs end.
     largest = tl.max(tl.where(squared == squared, squared, float("inf")), 0)
@@ -179,7 +185,7 @@ def snapshot_kernel(codebook, snapshot, travelled, squared_drift, ends, count, s
     """Take a snapshot of the codes, if they have jumped."""
     if have_jumped(ends, count):
         place = places(COPIED)
-        tl.store(snapshot + place, tl.load(codebook + place, mask=place < size, other=0.0), mask=place < size)
+        tl.store(snapshot + place, load_if(codebook + place, place < size), mask=place < size)
         if tl.program_id(0) == 0:
             tl.store(travelled, tl.load(travelled) + drift_of(squared_drift))
 
@@ -188,8 +194,8 @@ def snapshot_kernel(codebook, snapshot, travelled, squared_drift, ends, count, s
 def queue_kernel(ends, queue, count):
     """Line up the places at which the running sum ``ends`` rises."""
     place = places(COPIED)
-    end = tl.load(ends + place, mask=place < count, other=0)
-    before = tl.load(ends + place - 1, mask=(place < count) & (place > 0), other=0)
+    end = load_if(ends + place, place < count)
+    before = load_if(ends + place - 1, (place < count) & (place > 0))
     tl.store(queue + before, place.to(tl.int32), mask=end > before)
 
 
@@ -204,7 +210,7 @@ def check_kernel(
     """
     place = places(BLOCK)
     inside = place < count
-    row = tl.load(rows + place, mask=inside, other=0)
+    row = load_if(rows + place, inside)
     code = tl.load(last + row, mask=inside, other=-1)
     known = code >= 0
     drift = drift_of(squared_drift)
@@ -212,24 +218,24 @@ def check_kernel(
     squared_move = tl.zeros([BLOCK], tl.float32)
     squared = squared_move
     for j in range(DIM):
-        value = tl.load(x + row * DIM + j, mask=known, other=0.0)
-        step = value - tl.load(anchors + row * DIM + j, mask=known, other=0.0)
-        away = value - tl.load(codebook + code.to(tl.int64) * DIM + j, mask=known, other=0.0)
+        value = load_if(x + row * DIM + j, known)
+        step = value - load_if(anchors + row * DIM + j, known)
+        away = value - load_if(codebook + code.to(tl.int64) * DIM + j, known)
         squared_move = tl.fma(step, step, squared_move)
         squared = tl.fma(away, away, squared)
     moved = bound(squared_move)
-    proven = known & (bound(squared) + moved < tl.load(clearance + row, mask=known, other=0.0) - way)
+    proven = known & (bound(squared) + moved < load_if(clearance + row, known) - way)
     open_ = known & ~proven
     if tl.max(open_.to(tl.int32), 0) > 0:
         member = tl.arange(0, MEMBERS)
-        listed = tl.load(lists + row[:, None] * MEMBERS + member[None, :], mask=open_[:, None], other=0)
+        listed = load_if(lists + row[:, None] * MEMBERS + member[None, :], open_[:, None])
         distances = tl.zeros([BLOCK, MEMBERS], tl.float32)
         for j in range(DIM):
-            value = tl.load(x + row * DIM + j, mask=open_, other=0.0)
-            away = tl.load(codebook + listed.to(tl.int64) * DIM + j, mask=open_[:, None], other=0.0) - value[:, None]
+            value = load_if(x + row * DIM + j, open_)
+            away = load_if(codebook + listed.to(tl.int64) * DIM + j, open_[:, None]) - value[:, None]
             distances = tl.fma(away, away, distances)
         least, nearest = least_of(distances, listed, 0x7FFFFFFF)
-        limit = tl.load(limits + row, mask=open_, other=0.0)
+        limit = load_if(limits + row, open_)
         listed_is_nearest = open_ & (bound(least) + moved < limit - way)
         code = tl.where(listed_is_nearest, nearest, code)
         proven = proven | listed_is_nearest
@@ -239,7 +245,7 @@ def check_kernel(
         second = bound_below(others)
         anew = listed_is_nearest & (second - bound(least) > moved)
         for j in range(DIM):
-            tl.store(anchors + row * DIM + j, tl.load(x + row * DIM + j, mask=anew, other=0.0), mask=anew)
+            tl.store(anchors + row * DIM + j, load_if(x + row * DIM + j, anew), mask=anew)
         limit -= moved
         tl.store(limits + row, limit, mask=anew)
         tl.store(clearance + row, tl.minimum(limit, second - drift + (way - drift)), mask=anew)

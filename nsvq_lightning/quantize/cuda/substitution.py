@@ -18,7 +18,7 @@ from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.compute.rows import sorted_by_key
 from nsvq_lightning.quantize import substitution
-from nsvq_lightning.quantize.cuda.search import places
+from nsvq_lightning.quantize.cuda.search import load_if, places
 
 SPLIT = tl.constexpr(0x3F3504F3)  # bits of 1/√2: a mantissa lies in [1/√2, √2)
 TWO_LOG2_E = tl.constexpr(2 / math.log(2))
@@ -88,8 +88,8 @@ def chosen_rows(
     i = places(ROWS)[:, None]
     column = tl.arange(0, WIDTH)[None, :]
     inside = (i < count) & (column < DIM)
-    row = tl.load(rows + i, mask=i < count, other=0)
-    code = tl.load(codes + i, mask=i < count, other=0)
+    row = load_if(rows + i, i < count)
+    code = load_if(codes + i, i < count)
     there = inside & (row >= 0) & (row < height) & (code >= 0) & (code < num_codes)
     value = tl.load(x + row * DIM + column, mask=there, other=float("nan"))
     centre = tl.load(codebook + code * DIM + column, mask=there, other=float("nan"))
@@ -132,8 +132,8 @@ def radial_kernel(
     i, column, row, inside, there, value, centre = chosen_rows(
         x, rows, codebook, codes, count, height, num_codes, DIM, ROWS, WIDTH
     )
-    slope = tl.load(grad + i * DIM + column, mask=inside, other=0.0)
-    moved = tl.where(inside, tl.load(out + i * DIM + column, mask=inside, other=0.0) - value, 0.0)
+    slope = load_if(grad + i * DIM + column, inside)
+    moved = tl.where(inside, load_if(out + i * DIM + column, inside) - value, 0.0)
     residual = tl.where(inside, value - centre, 0.0)
     scale = tl.sum(slope * moved, 1)[:, None] * inverses(tl.sum(residual * residual, 1)[:, None])
     radial = residual * scale
@@ -215,8 +215,8 @@ def part_kernel(values, order, offsets, partial, dim, WIDTH: tl.constexpr):
         total = tl.zeros([ROWS, WIDTH], partial.dtype.element_ty)
         for start in range(first, last, ROWS):
             place = start + tl.arange(0, ROWS)[:, None]
-            row = tl.load(order + place, mask=place < last, other=0)
-            value = tl.load(values + row * dim + column, mask=(place < last) & (column < dim), other=0.0)
+            row = load_if(order + place, place < last)
+            value = load_if(values + row * dim + column, (place < last) & (column < dim))
             total += value.to(partial.dtype.element_ty)
         tl.store(partial + program * dim + column, tl.sum(total, 0), mask=column < dim)
 
@@ -229,7 +229,7 @@ def sum_kernel(partial, offsets, sums, dim, WIDTH: tl.constexpr):
     begin, end = tl.load(offsets + code), tl.load(offsets + code + 1)
     part = tl.arange(0, PARTS)[:, None]
     there = (part * part_size(begin, end) < end - begin) & (column < dim)[None, :]
-    total = tl.load(partial + (code * PARTS + part) * dim + column[None, :], mask=there, other=0.0)
+    total = load_if(partial + (code * PARTS + part) * dim + column[None, :], there)
     tl.store(sums + code * dim + column, tl.sum(total, 0), mask=column < dim)
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.compute.rows import sorted_by_key
-from nsvq_lightning.rendering.cuda.harmonics import places
+from nsvq_lightning.rendering.cuda.harmonics import load_if, places
 
 
 class Tiles(NamedTuple):
@@ -43,11 +43,11 @@ def expand_kernel(boxes, ends, keys, owners, total, count, halvings, columns, BL
     low, high = tl.zeros([BLOCK], tl.int32), tl.zeros([BLOCK], tl.int32) + count
     for _ in range(halvings):
         middle = (low + high) // 2
-        later = tl.load(ends + middle, mask=inside & (low < high), other=0) <= pair
+        later = load_if(ends + middle, inside & (low < high)) <= pair
         low, high = tl.where(later & (low < high), middle + 1, low), tl.where(later, high, middle)
-    begin = tl.load(ends + low - 1, mask=inside & (low > 0), other=0)
+    begin = load_if(ends + low - 1, inside & (low > 0))
     box = boxes + 4 * low.to(tl.int64)
-    x0, y0 = tl.load(box, mask=inside, other=0), tl.load(box + 1, mask=inside, other=0)
+    x0, y0 = load_if(box, inside), load_if(box + 1, inside)
     width = tl.load(box + 2, mask=inside, other=1)
     place = (pair - begin).to(tl.int32)
     tile = (y0 + place // width) * columns + x0 + place % width

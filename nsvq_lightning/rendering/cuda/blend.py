@@ -20,7 +20,7 @@ from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.rendering import formulas as shared
 from nsvq_lightning.rendering.cuda import records as rec
 from nsvq_lightning.rendering.cuda.binning import Tiles
-from nsvq_lightning.rendering.cuda.harmonics import load_row, places, store_row
+from nsvq_lightning.rendering.cuda.harmonics import load_if, load_row, places, store_row
 from nsvq_lightning.rendering.cuda.projection import Lens
 
 formulas = for_triton(shared)
@@ -45,10 +45,10 @@ def tile_pixels(tile, columns, width, height):
 def fetch(records, ranks, j, end):
     """The record at place ``j`` of the lists, before ``end``, and what α depends on: a, b, c, x, y, log2 opacity."""
     there = j < end
-    record = records + tl.load(ranks + j, mask=there, other=0).to(tl.int64) * rec.RECORD
+    record = records + load_if(ranks + j, there).to(tl.int64) * rec.RECORD
     a, b, c = load_row(record + rec.A, 3, there)
     px, py = load_row(record + rec.X, 2, there)
-    return record, a, b, c, px, py, tl.load(record + rec.LOG2_OPACITY, mask=there, other=0.0)
+    return record, a, b, c, px, py, load_if(record + rec.LOG2_OPACITY, there)
 
 
 @triton.jit
@@ -122,14 +122,14 @@ def blend_backward_kernel(
     rest = g_red * red + g_green * green + g_blue * blue
     if WITH_ALPHA:
         # Alpha is 1 - T, so its gradient enters as -g_alpha·T at the far end.
-        kept = tl.load(transmittance + pixel, mask=inside, other=0.0)
-        rest -= tl.load(g_alpha + pixel, mask=inside, other=0.0) * kept
+        kept = load_if(transmittance + pixel, inside)
+        rest -= load_if(g_alpha + pixel, inside) * kept
     g_far = tl.zeros_like(rest)
     if WITH_DEPTH:
-        g_far = tl.load(g_depth + pixel, mask=inside, other=0.0)
-        rest += g_far * tl.load(depth + pixel, mask=inside, other=0.0)
+        g_far = load_if(g_depth + pixel, inside)
+        rest += g_far * load_if(depth + pixel, inside)
     if WITH_ABSGRAD:
-        strength = tl.load(pixel_weights + pixel, mask=inside, other=0.0)
+        strength = load_if(pixel_weights + pixel, inside)
     t = tl.where(inside, 1.0, 0.0)
     begin, end = tl.load(offsets + tile), tl.load(ends + tile)
     following = fetch(records, ranks, begin, end)
@@ -177,22 +177,22 @@ def total_kernel(
     """
     rank = places(SPLATS)
     seen = rank < count
-    end = tl.load(slot_ends + rank, mask=seen, other=0)
-    begin = tl.load(slot_ends + rank - 1, mask=seen & (rank > 0), other=0)
+    end = load_if(slot_ends + rank, seen)
+    begin = load_if(slot_ends + rank - 1, seen & (rank > 0))
     field = tl.arange(0, LANES)[None, None, :]
     acc = tl.zeros([SPLATS, SLOTS, LANES], tl.float32)
     for start in range(0, tl.max(end - begin, 0), SLOTS):
         slot = begin[:, None, None] + start + tl.arange(0, SLOTS)[None, :, None]
         mask = (slot < end[:, None, None]) & (field < (rec.ABSGRAD_FIELDS if WITH_ABSGRAD else rec.FIELDS))
         place = slot.to(tl.int64) * (rec.ABSGRAD_SLOT if WITH_ABSGRAD else rec.RECORD) + field
-        acc += tl.load(sums + place, mask=mask, other=0.0)
+        acc += load_if(sums + place, mask)
     total = tl.sum(acc, 1)
     lane = tl.arange(0, LANES)[None, :]
     tl.store(totals + rank[:, None] * rec.RECORD + lane, total, mask=seen[:, None] & (lane < rec.FIELDS))
     u, v = field_of(total, rec.SUM_U), field_of(total, rec.SUM_V)
     record = records + rank * rec.RECORD
     a, b, c = load_row(record + rec.A, 3, seen)
-    row = tl.load(ids + rank, mask=seen, other=0)
+    row = load_if(ids + rank, seen)
     store_row(g_means2d + 2 * row, (a * u * formulas.TWO_LN2, (b * u + c * v) * formulas.TWO_LN2), seen)
     if WITH_ABSGRAD:
         x = tl.abs(a) * field_of(total, rec.ABS_X) * formulas.TWO_LN2

@@ -19,11 +19,17 @@ def places(SIZE: tl.constexpr):
 
 
 @triton.jit
+def load_if(pointer, mask):
+    """What a pointer leads to; 0 where the mask is not set."""
+    return tl.load(pointer, mask=mask, other=0)
+
+
+@triton.jit
 def load_row(pointer, count, mask):
     """Consecutive floats at each of the pointers."""
     values = ()
     for k in tl.static_range(count):
-        values += (tl.load(pointer + k, mask=mask, other=0.0),)
+        values += (load_if(pointer + k, mask),)
     return values
 
 

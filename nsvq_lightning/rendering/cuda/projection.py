@@ -14,7 +14,7 @@ from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.rendering import formulas as shared
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda import records as rec
-from nsvq_lightning.rendering.cuda.harmonics import color, color_backward, load_row, places, store_row
+from nsvq_lightning.rendering.cuda.harmonics import color, color_backward, load_if, load_row, places, store_row
 from nsvq_lightning.rendering.sampling import ViewSampling
 from nsvq_lightning.splats.attributes import attribute_shapes
 from nsvq_lightning.splats.splats import sh_degree_of
@@ -70,7 +70,7 @@ def project_kernel(
     row = places(BLOCK)
     inside = row < n
     mean, quat, scale = load_geometry(means, quats, scales, row, inside)
-    logit = tl.load(logits + row, mask=inside, other=0.0)
+    logit = load_if(logits + row, inside)
     camera = load_view(view, fx, fy)
     screen = (cx, cy, width, height, tl.load(view + NEAR))
     point = formulas.view_point(camera, mean)
@@ -112,13 +112,13 @@ def project_backward_kernel(
     x, y, z = formulas.view_point(camera, mean)
     total, record = totals + rank * rec.RECORD, records + rank * rec.RECORD
     centre = load_row(g_means2d + 2 * row, 2, seen)
-    h = tl.load(total + rec.SUM_H, mask=seen, other=0.0)
+    h = load_if(total + rec.SUM_H, seen)
     trained_at = None
     if distances is not None:
         trained_at = load_sampling(distances, size, row, n, seen)
     g_mean, g_quat, g_scale = formulas.geometry_backward(
         camera, (x, y, tl.where(seen, z, 1.0)), quat, scale, load_row(record + rec.A, 3, seen),
-        load_row(total + rec.SUM_UU, 3, seen), h, centre, tl.load(total + rec.SUM_DEPTH, mask=seen, other=0.0),
+        load_row(total + rec.SUM_UU, 3, seen), h, centre, load_if(total + rec.SUM_DEPTH, seen),
         trained_at,
     )  # fmt: skip
     store_row(g_scales + 3 * row, g_scale, inside)
@@ -131,7 +131,7 @@ def project_backward_kernel(
     for k in range(3 * (DEGREE + 1) * (DEGREE + 1) - 3, STRIDE):  # of the bands that are not evaluated
         tl.store(g_row + k, 0.0, mask=inside)
     store_row(g_means + 3 * row, formulas.add3(g_mean, formulas.mean_gradient(d, d_inverse, g_d)), inside)
-    logit = tl.load(logits + row, mask=seen, other=0.0)
+    logit = load_if(logits + row, seen)
     tl.store(g_logits + row, formulas.logit_gradient(logit, h), mask=inside)
 
 
@@ -139,7 +139,7 @@ def project_backward_kernel(
 def take_kernel(table, ids, n, taken, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
     """Rows ``ids`` of a table; torch's own indexing takes ten times as long for rows of whole 16-byte words."""
     place, field = places(BLOCK), tl.arange(0, 16)
-    row = tl.load(ids + place, mask=place < n, other=0)
+    row = load_if(ids + place, place < n)
     wanted = (place < n)[:, None] & (field < WIDTH)[None]
     found = tl.load(table + row[:, None] * WIDTH + field, mask=wanted)
     tl.store(taken + place[:, None] * WIDTH + field, found, mask=wanted)
