@@ -60,7 +60,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_root(parser, "scene folder for --floaters, --up, --align; for --measure, --splats in place of its own pictures")
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> None:
     """Convert a file.
 
     Raises:
@@ -86,7 +86,6 @@ def run(options: Namespace) -> int:
         # What reading the files again would say of them is known here.
         log.setLevel("WARNING")
         _measure(options.inputs[0], output, options.root)
-    return 0
 
 
 # Formats that have an option of the writer; the first is named where another one is given.

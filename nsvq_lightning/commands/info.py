@@ -16,11 +16,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the description as JSON")
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> None:
     """Print the description of one file, without importing torch."""
     description = describe(options.file)
     say(json.dumps(description, indent=2, ensure_ascii=False) if options.json else _text(description))
-    return 0
 
 
 # Columns of a table that hold words.

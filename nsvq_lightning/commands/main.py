@@ -124,7 +124,7 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
         arguments: What follows the name.
 
     Returns:
-        Exit status: what ``run`` returns, or 1 after an error in the user's files.
+        Exit status: what ``run`` returns, 0 for nothing, or 1 after an error in the user's files.
     """
     command = import_module(f"{__package__}.{name}")
     about, _, more = cleandoc(command.__doc__ or "").partition("\n\n")
@@ -139,7 +139,7 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
         options.further = further  # for the commands that pass them on
     _show_log()
     try:
-        return int(command.run(options))
+        return int(command.run(options) or 0)
     except ArgumentError as error:
         parser.error(str(error))
     except (ValueError, OSError) as error:

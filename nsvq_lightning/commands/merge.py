@@ -18,7 +18,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="file to write, of any format")
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> None:
     """Join what lies in the core of each part.
 
     Raises:
@@ -58,4 +58,3 @@ def run(options: Namespace) -> int:
     look = renderer(on_white(scene) if photos.white else scene)
     quality, _ = evaluate(look, scene.tensors(), map(photos.view, photos.test))
     say(f"  test photos of {photos.root}: {quality:.2f} dB")
-    return 0

@@ -66,7 +66,7 @@ def _color(text: str) -> tuple[float, ...]:
     return values
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> None:
     """Render a path.
 
     Raises:
@@ -102,7 +102,6 @@ def run(options: Namespace) -> int:
             write(look(raw, camera).image)
     length = f", {len(cameras) / fps:.1f} s at {fps:g} frames per second" if is_video else ""
     say(f"{output}: {len(cameras)} frames of {width}x{height}{length}")
-    return 0
 
 
 def _path(

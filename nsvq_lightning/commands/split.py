@@ -36,7 +36,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--blocks", type=positive(int), default=4, metavar="N", help="number of parts; 4 by default")
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> None:
     """Write the parts, and print the commands that train them.
 
     Raises:
@@ -70,4 +70,3 @@ def run(options: Namespace) -> int:
         root = folder.resolve()
         ends = [f"--data.root={root}", f"--trainer.run_folder={root / RUN}", *AS_WRITTEN * bool(read)]
         say(shlex.join(["nsvq", "fit", *behind, *options.further, *ends]))
-    return 0

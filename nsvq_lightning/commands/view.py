@@ -48,7 +48,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 _LARGEST = 400_000_000
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> None:
     """Serve a scene until Ctrl-C, or write its page.
 
     Raises:
@@ -72,7 +72,7 @@ def run(options: Namespace) -> int:
             make_folder_of(options.output)
             size = write_viewer(options.output, file, cameras, title)
             say(f"{options.output}: {size:,} bytes")
-            return 0
+            return
         # Seconds between two looks.
         page = viewer_page(file, cameras, title, live=3.0 if options.live else 0.0).encode()
         live = options.scene / LIVE_SCENE if options.live else None
@@ -88,7 +88,6 @@ def run(options: Namespace) -> int:
                 # A browser in this terminal returns when it is left.
                 Thread(target=webbrowser.open, args=(address,), daemon=True).start()
             server.serve_forever()
-    return 0
 
 
 @contextmanager

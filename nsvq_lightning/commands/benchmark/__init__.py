@@ -61,7 +61,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 QUICK = {"repeats": 3, "seconds": 0.5, "workloads": ("A20k",), "steps": 40}
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> None:
     """Measure, and print the tables.
 
     Raises:
@@ -90,4 +90,3 @@ def run(options: Namespace) -> int:
         found[name] = list(suite.run(scope))
         sys.stderr.write(f"{name}: {time.perf_counter() - start:.1f} s\n")
     sys.stdout.write(as_markdown(about, scope, found))
-    return 0
