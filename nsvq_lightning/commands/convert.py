@@ -133,7 +133,12 @@ def _edited(scene: CompressedScene, options: Namespace) -> CompressedScene:
         scene = _without_floaters(scene, options.root)
     left = splats_left(options.splats, len(scene))
     if left < len(scene):
-        scene = _thinned(scene, left, options)
+        from nsvq_lightning.compression.viewpoints import VIEWS
+        from nsvq_lightning.random import top_rows
+        from nsvq_lightning.training.importance import contributions
+
+        cameras = views_of(options.inputs[0], scene, VIEWS, options.root)
+        scene = scene.take(top_rows(contributions(scene.tensors(), cameras, renderer(scene)), left).numpy())
     if options.up:
         scene = placing.rotated(scene, placing.turn_up(_up(options), options.up))
     if options.matrix:
@@ -181,16 +186,6 @@ def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     count = int(removed.sum())
     say(f"floaters: {count:,} of {len(scene):,} splats; test photos at {before:.2f} dB before, {after:.2f} dB after")
     return scene.take((~removed).numpy())
-
-
-def _thinned(scene: CompressedScene, count: int, options: Namespace) -> CompressedScene:
-    """The splats that contribute most to photos of --data.root, or to the scene's own pictures."""
-    from nsvq_lightning.compression.viewpoints import VIEWS
-    from nsvq_lightning.random import top_rows
-    from nsvq_lightning.training.importance import contributions
-
-    cameras = views_of(options.inputs[0], scene, VIEWS, options.root)
-    return scene.take(top_rows(contributions(scene.tensors(), cameras, renderer(scene)), count).numpy())
 
 
 def _measure(source: Path, output: Path, root: Path | None) -> None:

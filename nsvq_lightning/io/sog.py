@@ -71,7 +71,10 @@ def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
 
     if not 1 <= palette <= PALETTE_LIMIT:
         raise ValueError(f"palette must be in 1..{PALETTE_LIMIT}, got {palette}")
-    halves, means = _packed_means(scene.means)
+    wide = scene.means.astype(np.float64)
+    logs = np.copysign(np.log1p(np.abs(wide)), wide)
+    low, high = logs.min(0), logs.max(0)
+    halves = _low_and_high(np.rint(65535 * ((logs - low) / np.where(high > low, high - low, 1))))
     scales, scale_levels = _leveled(scene.rows("scales"))
     colors, color_levels = _leveled(scene.rows("sh0"))
     texels = {
@@ -87,7 +90,7 @@ def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
         "count": len(scene),
         # The second is how it was said before; readers know one of them.
         **({"model": "antialiased", "antialias": True} if scene.antialiased else {}),
-        "means": {**means, "files": ["means_l.webp", "means_u.webp"]},
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scale_levels, "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_levels, "files": ["sh0.webp"]},
@@ -318,15 +321,6 @@ def _visibility(scene: CompressedScene) -> Float64s:
     sizes = np.sort(scene.rows("scales"), axis=1)[:, 1:].mean(1).astype(np.float64)
     weight: Float64s = opacity_of(scene.opacities) * np.exp(sizes - sizes.max())
     return weight / float(weight.mean()) + 0.01
-
-
-def _packed_means(means: Float32s) -> tuple[Uint8s, dict[str, list[float]]]:
-    """Low and high bytes ``[N, 3, 2]`` of positions, and what ``meta.json`` says of them."""
-    wide = means.astype(np.float64)
-    logs = np.copysign(np.log1p(np.abs(wide)), wide)
-    low, high = logs.min(0), logs.max(0)
-    extent = np.where(high > low, high - low, 1)
-    return _low_and_high(np.rint(65535 * ((logs - low) / extent))), {"mins": low.tolist(), "maxs": high.tolist()}
 
 
 def _low_and_high(numbers: Arrays) -> Uint8s:

@@ -46,19 +46,16 @@ def _centred(codebook: Array) -> tuple[Array, Array, Array, np.float32]:
 
 
 @inline
-def true_distance(dim, x, row, codebook, code):
-    """Squared distance as a sum of squared differences in one fixed order; it decides between codes that tie."""
+def closer(dim, x, row, codebook, code, distance, candidate):
+    """The nearer of a code at ``distance`` and a candidate, and its distance; of equally near ones the lower.
+
+    Squared distances are sums of squared differences in one fixed order.
+    """
     total = simd.broadcast(0)
     for j in range(dim):
-        difference = simd.get(codebook, code * dim + j) - simd.get(x, row * dim + j)
+        difference = simd.get(codebook, candidate * dim + j) - simd.get(x, row * dim + j)
         total = simd.fma(difference, difference, total)
-    return simd.lane_min(total)
-
-
-@inline
-def closer(dim, x, row, codebook, code, distance, candidate):
-    """The nearer of a code at ``distance`` and a candidate, and its distance; of equally near ones the lower."""
-    candidate_distance = true_distance(dim, x, row, codebook, candidate)
+    candidate_distance = simd.lane_min(total)
     if candidate_distance < distance or (candidate_distance == distance and candidate < code):
         return candidate, candidate_distance
     return code, distance
@@ -166,15 +163,6 @@ def _score_block(dim, blocks, halves, block, rows, first, kept, state):
 
 
 @inline
-def _score_tile(dim, blocks, halves, rows, count, kept, state):
-    total = halves.shape[0] // 32
-    for chunk in range(0, total, _CHUNK):
-        for first in range(0, count, _GROUP):
-            for block in range(chunk, min(total, chunk + _CHUNK)):
-                _score_block(dim, blocks, halves, block, rows, first, kept, state)
-
-
-@inline
 def _settle(dim, x, row, codebook, scores, codes, at, kept, limit):
     """Nearest code by true distance among those with a score up to ``limit``."""
     code = simd.integer(codes, at)
@@ -225,7 +213,11 @@ def _search_kernel(dim: int) -> Any:
             margins[i] = rounding * norms * norms
             # Without a list, only codes that may be nearest after rounding are kept.
             slack[i] = F(np.inf) if with_lists else F(2.0) * margins[i]
-        _score_tile(dim, blocks, halves, rows, (valid + _GROUP - 1) // _GROUP * _GROUP, kept, state)
+        total = halves.shape[0] // 32
+        for chunk in range(0, total, _CHUNK):
+            for first in range(0, valid, _GROUP):
+                for block in range(chunk, min(total, chunk + _CHUNK)):
+                    _score_block(dim, blocks, halves, block, rows, first, kept, state)
         for i in range(valid):
             at, row = i * _BEST, start + i
             limit, others = scores[at] + margins[i], scores[at + kept - 1]

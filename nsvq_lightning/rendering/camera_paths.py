@@ -100,7 +100,11 @@ def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     x, y = arms @ across, arms @ ahead
     height = np.median(arms @ up)
     radius = np.median(np.hypot(x, y))
-    start, arc = _arc(np.arctan2(y, x))
+    # The arc that cameras fill: the circle without their largest gap.
+    angles = np.sort(np.arctan2(y, x))
+    gaps = np.diff(angles, append=angles[:1] + 2 * math.pi)
+    widest = np.argmax(gaps)
+    start, arc = angles[(widest + 1) % len(angles)], 2 * math.pi - gaps[widest]
     turns = 2 * math.pi * (np.arange(frames) / frames)
     if arc < math.radians(270):
         turns = arc * (0.5 + 0.5 * np.sin(turns))
@@ -224,11 +228,3 @@ def _times_smaller(arguments: str, width: int) -> float:
     if asked in (1, 2, 4, 8):
         return smaller * asked
     return width / asked if asked > 0 else max(smaller, width / 1600)
-
-
-def _arc(angles: Float64s) -> tuple[float, float]:
-    """Start and length of the arc that angles fill: the circle without their largest gap."""
-    ordered = np.sort(angles)
-    gaps = np.diff(ordered, append=ordered[:1] + 2 * math.pi)
-    widest = np.argmax(gaps)
-    return float(ordered[(widest + 1) % len(ordered)]), float(2 * math.pi - gaps[widest])

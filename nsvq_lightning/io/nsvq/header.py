@@ -179,11 +179,14 @@ class Header:
             FormatError: An entry is missing or has the wrong type.
         """
         table = json_object(text, "the header")
+        origin = _entry(table, "origin", list)
+        if not _are_numbers(origin, 3):
+            raise FormatError("damaged: header entry 'origin' must be three finite numbers")
         header = cls(
             level=_entry(table, "level", str),
             splats=_entry(table, "splats", int),
             sh_degree=_entry(table, "sh_degree", int),
-            origin=_origin(_entry(table, "origin", list)),
+            origin=tuple(map(float, origin)),  # type: ignore[arg-type]  # they are three
             attributes=tuple(_row(AttributeEntry, row) for row in _entry(table, "attributes", list)),
             streams=tuple(_row(StreamEntry, row) for row in _entry(table, "streams", list)),
             config=_entry(table, "config", dict),
@@ -216,13 +219,6 @@ def _row(kind: type[_T], row: object) -> _T:
         raise FormatError(f"damaged: a row of the header's tables does not hold {', '.join(columns)}")
     named = dict(zip(columns, row, strict=True))
     return kind(**{name: _entry(named, name, column) for name, column in columns.items()})
-
-
-def _origin(values: list[Any]) -> Place:
-    if not _are_numbers(values, 3):
-        raise FormatError("damaged: header entry 'origin' must be three finite numbers")
-    x, y, z = map(float, values)
-    return x, y, z
 
 
 def _cameras(rows: list[Any]) -> _Cameras:

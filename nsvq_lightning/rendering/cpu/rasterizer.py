@@ -17,6 +17,7 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cpu import binning, harmonics, projection, projection_backward
 from nsvq_lightning.rendering.cpu import blend as blending
 from nsvq_lightning.rendering.cpu import records as rec
+from nsvq_lightning.rendering.formulas import TILE
 from nsvq_lightning.rendering.sampling import Layers, Shading, ViewSampling
 from nsvq_lightning.skips import is_on
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
@@ -36,7 +37,8 @@ class _Frame:
             nearest, farthest = sampling.distances
             self.sampling = flat(nearest), flat(farthest), np.float32(sampling.size)
         self.size = width, height = camera.size
-        self.group_columns, group_rows = rec.group_grid(width, height)
+        side = TILE << rec.GROUP_SHIFT
+        self.group_columns, group_rows = -(-width // side), -(-height // side)
         self.tiles = self.group_columns * group_rows * rec.GROUP_TILES
         self.n = n = splats.means.shape[0]
         shapes = ((n, *shape) for shape in attribute_shapes(sh_degree_of(splats.shN)).values())

@@ -58,12 +58,6 @@ GROUP_SHIFT = 2
 GROUP_TILES = 1 << 2 * GROUP_SHIFT
 
 
-def group_grid(width: int, height: int) -> tuple[int, int]:
-    """Columns and rows of groups that cover an image."""
-    side = TILE << GROUP_SHIFT
-    return -(-width // side), -(-height // side)
-
-
 @inline
 def get3(array, offset):
     """Three consecutive numbers."""
