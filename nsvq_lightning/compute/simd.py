@@ -23,6 +23,7 @@ from numba.core import cgutils
 from numba.core.typeconv import Conversion
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
+from numba.types import Array, UniTuple, float32, int64, void
 
 WIDTH = 16
 
@@ -56,7 +57,7 @@ class _VectorModel(models.PrimitiveModel):
 
 @lower_cast(types.Number, Lanes)
 def _spread(context, builder, kind, _, value):
-    return _broadcast(builder, _VF, context.cast(builder, value, kind, types.float32))
+    return _broadcast(builder, _VF, context.cast(builder, value, kind, float32))
 
 
 # ---- declaring operators and functions
@@ -83,7 +84,7 @@ def _function(result, *parameters):
             made = emit(builder, *opened)
             if isinstance(made, list):
                 return context.make_tuple(builder, sig.return_type, made)
-            return context.get_dummy_value() if sig.return_type == types.void else made
+            return context.get_dummy_value() if sig.return_type == void else made
 
         @intrinsic
         @wraps(emit)  # from which Numba reads the number of arguments
@@ -101,7 +102,7 @@ def _function(result, *parameters):
 
 
 def _opened(context, builder, kind, value):
-    if isinstance(kind, types.Array):
+    if isinstance(kind, Array):
         return cgutils.create_struct_proxy(kind)(context, builder, value).data
     return cgutils.unpack_tuple(builder, value, len(kind)) if isinstance(kind, types.BaseTuple) else value
 
@@ -192,19 +193,19 @@ def broadcast(builder, scalar):
     return scalar
 
 
-@_function(Lanes, types.Array, types.int64)
+@_function(Lanes, Array, int64)
 def load(builder, array, offset):
     """``load(array, offset)``: 16 consecutive floats."""
     return _read(builder, builder.gep(array, [offset]))
 
 
-@_function(types.void, types.Array, types.int64, Lanes)
+@_function(void, Array, int64, Lanes)
 def store(builder, array, offset, lanes):
     """``store(array, offset, lanes)``: 16 consecutive floats."""
     _write(builder, builder.gep(array, [offset]), lanes)
 
 
-@_function(_ELEMENT, types.Array, types.int64)
+@_function(_ELEMENT, Array, int64)
 def get(builder, array, offset):
     """``get(array, offset)``: one element, without the sign check of Numba's indexing."""
     return builder.load(builder.gep(array, [offset]))
@@ -216,18 +217,18 @@ def integer(typingctx, array, offset):
 
     def emit(context, builder, sig, values):
         address = builder.gep(_opened(context, builder, array, values[0]), [values[1]])
-        return context.cast(builder, builder.load(address), array.dtype, types.int64)
+        return context.cast(builder, builder.load(address), array.dtype, int64)
 
-    return types.int64(array, types.int64), emit
+    return int64(array, int64), emit
 
 
-@_function(types.void, types.Array, types.int64, _ELEMENT)
+@_function(void, Array, int64, _ELEMENT)
 def put(builder, array, offset, value):
     """``put(array, offset, value)``: one element, without the sign check of Numba's indexing."""
     builder.store(value, builder.gep(array, [offset]))
 
 
-@_function(types.void, types.Array, types.int64)
+@_function(void, Array, int64)
 def prefetch(builder, array, offset):
     """``prefetch(array, offset)``: ask for the cache line of one element."""
     address = builder.bitcast(builder.gep(array, [offset]), _i8.as_pointer())
@@ -237,7 +238,7 @@ def prefetch(builder, array, offset):
 @intrinsic(prefer_literal=True)
 def scratch(typingctx, count):
     """``scratch(count)``: as many floats, a constant, of whatever content, on the stack: gone when the kernel ends."""
-    kind, size = types.Array(types.float32, 1, "C"), count.literal_value
+    kind, size = Array(float32, 1, "C"), count.literal_value
 
     def emit(context, builder, sig, values):
         with builder.goto_entry_block():
@@ -327,19 +328,19 @@ def log2(builder, x):
 # ------------------------------------------------------------------------------------------------------------
 
 
-@_function(types.int64, Mask)
+@_function(int64, Mask)
 def mask_bits(builder, mask):
     """The mask as an integer, lane 0 in the lowest bit."""
     return builder.zext(builder.bitcast(mask, _i16), _i64)
 
 
-@_function(types.int64, types.int64)
+@_function(int64, int64)
 def lowest_bit(builder, bits):
     """Position of the lowest set bit of an integer; 64 for 0."""
     return builder.cttz(bits, _i1(0))
 
 
-@_function(types.int64, types.Array, types.int64, types.int64)
+@_function(int64, Array, int64, int64)
 def column_bits(builder, array, offset, k):
     """``column_bits(uint16_array, offset, k)``: bit k of 64 consecutive elements as one 64-bit integer."""
     kind = ir.VectorType(_i16, 64)
@@ -360,19 +361,19 @@ def _folded(builder, value, combine):
     return builder.extract_element(value, _i32(0))
 
 
-@_function(types.float32, Lanes)
+@_function(float32, Lanes)
 def lane_sum(builder, lanes):
     """Sum of the 16 lanes, always in the same order."""
     return _folded(builder, lanes, _add)
 
 
-@_function(types.float32, Lanes)
+@_function(float32, Lanes)
 def lane_min(builder, lanes):
     """Smallest of the 16 lanes; a NaN lane may be passed over or returned."""
     return _folded(builder, lanes, lambda builder, x, y: _smaller(builder, y, x))
 
 
-@_function(Lanes, types.UniTuple)
+@_function(Lanes, UniTuple)
 def lane_sums(builder, vectors):
     """``lane_sums((v0, v1, …))``: lane i of the result is the sum of the lanes of vector i, 0 beyond the last."""
     vectors = vectors + [_constant(0.0)] * (WIDTH - len(vectors))
@@ -404,10 +405,10 @@ def _transposed(builder, rows):
     return rows
 
 
-_SIXTEEN = types.UniTuple(Lanes, WIDTH)
+_SIXTEEN = UniTuple(Lanes, WIDTH)
 
 
-@_function(_SIXTEEN, types.Array, types.int64)
+@_function(_SIXTEEN, Array, int64)
 def load_vectors(builder, array, offset):
     """``load_vectors(array, offset)``: 256 consecutive floats as sixteen vectors."""
     first = builder.gep(array, [offset])
@@ -424,7 +425,7 @@ def _row_addresses(builder, array, indices, start, stride):
         yield builder.gep(array, [builder.mul(builder.sext(index, _i64), stride)])
 
 
-@_function(_SIXTEEN, types.Array, types.Array, types.int64, types.int64, types.int64)
+@_function(_SIXTEEN, Array, Array, int64, int64, int64)
 def gather_columns(builder, array, indices, start, stride, column):
     """``gather_columns(array, indices, start, stride, column)``: 16 columns of 16 chosen rows.
 
@@ -435,7 +436,7 @@ def gather_columns(builder, array, indices, start, stride, column):
 
 
 def _gatherer(columns):
-    @_function(types.UniTuple(Lanes, columns), types.Array, types.Array, types.int64)
+    @_function(UniTuple(Lanes, columns), Array, Array, int64)
     def gather_rows(builder, array, indices, start):
         """``gather_rows(array, indices, start)``: 16 chosen rows, column by column."""
         vectors = [ir.Constant(_VF, ir.Undefined)] * columns
@@ -449,7 +450,7 @@ def _gatherer(columns):
 
 
 def _scatterer(columns):
-    @_function(types.void, types.Array, types.Array, types.int64, types.UniTuple(Lanes, columns))
+    @_function(void, Array, Array, int64, UniTuple(Lanes, columns))
     def scatter_rows(builder, array, indices, start, vectors):
         """``scatter_rows(array, indices, start, vectors)``: the inverse of ``gather_rows``."""
         for lane, address in enumerate(_row_addresses(builder, array, indices, start, _i64(columns))):
@@ -470,7 +471,7 @@ def _columns(builder, rows, count):
 
 
 def _row_loader(columns):
-    @_function(types.UniTuple(Lanes, columns), types.Array, types.int64)
+    @_function(UniTuple(Lanes, columns), Array, int64)
     def load_rows(builder, array, offset):
         """``load_rows(array, offset)``: 16 consecutive rows, column by column."""
         return _columns(builder, _read(builder, builder.gep(array, [offset]), WIDTH * columns), columns)
@@ -497,7 +498,7 @@ def _joined(builder, parts):
 def _block_loader(channels):
     """``offset`` is the element of a block's first pixel, ``stride`` the floats from the start of a row to the next."""
 
-    @_function(types.UniTuple(Lanes, channels), types.Array, types.int64, types.int64)
+    @_function(UniTuple(Lanes, channels), Array, int64, int64)
     def load_block(builder, image, offset, stride):
         """``load_block(image, offset, stride)``: a 4x4 block of an image, channel by channel."""
         addresses = _line_addresses(builder, image, offset, stride)
@@ -508,7 +509,7 @@ def _block_loader(channels):
 
 
 def _block_storer(channels):
-    @_function(types.void, types.Array, types.int64, types.int64, types.UniTuple(Lanes, channels))
+    @_function(void, Array, int64, int64, UniTuple(Lanes, channels))
     def store_block(builder, image, offset, stride, planes):
         """``store_block(image, offset, stride, planes)``: the inverse of ``load_block``."""
         block = _joined(builder, [*planes, planes[0]])

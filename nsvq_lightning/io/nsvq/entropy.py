@@ -7,7 +7,7 @@ probability of a decision is kept.
 from functools import partial
 
 import numpy as np
-from numba import uint64
+from numba import int64, uint64
 
 from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array, check_inside
@@ -215,7 +215,7 @@ def _ended(words, state):  # type: ignore[no-untyped-def]
 @inline
 def _path_of(paths, row):  # type: ignore[no-untyped-def]
     """The path of a row, or -1 without a row, which agrees with no path."""
-    return paths[row] if row >= 0 else np.int64(-1)
+    return paths[row] if row >= 0 else int64(-1)
 
 
 @inline
@@ -227,7 +227,7 @@ def _way(neighbour, path, left):  # type: ignore[no-untyped-def]
 @inline
 def _contexts_of(first, second, path, left, bits, two):  # type: ignore[no-untyped-def]
     """The node where a decision is taken, with the branches of the two neighbours there, and, with ``two``, alone."""
-    node = (np.int64(1) << (bits - 1 - left)) + path
+    node = (int64(1) << (bits - 1 - left)) + path
     context = _RELATIONS * node + 3 * _way(first, path, left) + _way(second, path, left)
     return context, (_RELATIONS << min(bits, _MODELLED_BITS)) + node if two else context
 
@@ -238,7 +238,7 @@ def _write_paths(paths, bits, neighbours, words, contexts):  # type: ignore[no-u
     plain = max(0, bits - _MODELLED_BITS)
     for i in range(len(paths)):
         first, second = _path_of(paths, neighbours[i, 0]), _path_of(paths, neighbours[i, 1])
-        path = np.int64(0)
+        path = int64(0)
         for left in range(bits - 1, plain - 1, -1):
             bit = (paths[i] >> left) & 1
             context, quick = _contexts_of(first, second, path, left, bits, True)
@@ -254,13 +254,13 @@ def _read_paths(words, bits, neighbours, paths, contexts, two):  # type: ignore[
     plain = max(0, bits - _MODELLED_BITS)
     for i in range(len(paths)):
         first, second = _path_of(paths, neighbours[i, 0]), _path_of(paths, neighbours[i, 1])
-        path = np.int64(0)
+        path = int64(0)
         for left in range(bits - 1, plain - 1, -1):
             context, quick = _contexts_of(first, second, path, left, bits, two)
             bit, state = rc.decode_bit(context, quick, contexts, state, words)
             path = 2 * path + bit
         rest, state = rc.decode_plain(plain, state, words)
-        paths[i] = (path << plain) + np.int64(rest)
+        paths[i] = (path << plain) + int64(rest)
         if _ended(words, state):
             break
     return state[2]
@@ -330,7 +330,7 @@ def _write_keys(keys, depths, words, contexts):  # type: ignore[no-untyped-def]
         state = _write_length(length, start, contexts, state, words)
         state = rc.encode_plain(_below(step, length), length - 1, state, words)
         last = keys[i]
-        before = length + np.int64(shift) if length else 0
+        before = length + int64(shift) if length else 0
     return rc.encode_end(state, words)
 
 
@@ -349,7 +349,7 @@ def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
         last = ((last >> shift) + step) << shift  # of two numbers below 2^63: no carry is lost
         if last > _KEY_MASK:
             return _OUTSIDE
-        before = length + np.int64(shift) if length else 0
+        before = length + int64(shift) if length else 0
         keys[i] = last
         if _ended(words, state):
             break
@@ -363,9 +363,9 @@ def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
 def _expected(values, row, before, column, mode):  # type: ignore[no-untyped-def]
     """What a number is written as the difference from; the row before is -1 for the first one."""
     from_column, from_row = (mode & 2) > 0 and column > 0, (mode & 1) > 0 and before >= 0
-    found = np.int64(values[row, column - 1]) if from_column else np.int64(0)
+    found = int64(values[row, column - 1]) if from_column else int64(0)
     if from_row:
-        found += np.int64(values[before, column]) - (np.int64(values[before, column - 1]) if from_column else 0)
+        found += int64(values[before, column]) - (int64(values[before, column - 1]) if from_column else 0)
     return found
 
 
@@ -375,14 +375,14 @@ def _write_integers(values, order, modes, words, contexts):  # type: ignore[no-u
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
             before = order[i - 1] if i > 0 else -1
-            value = np.int64(values[order[i], j]) - _expected(values, order[i], before, j, modes[j])
+            value = int64(values[order[i], j]) - _expected(values, order[i], before, j, modes[j])
             size = uint64(abs(value))
             length = _length(size)
             start = _INTEGER_CONTEXTS * j
             state = _write_length(length, start, contexts, state, words)
             state = rc.encode_plain(value < 0, min(length, 1), state, words)
             if length > 1:
-                second = np.int64(size >> uint64(length - 2)) & 1
+                second = int64(size >> uint64(length - 2)) & 1
                 context = _second_context(start, length)
                 state = rc.encode_bit(second, context, context, contexts, state, words)
                 state = rc.encode_plain(_below(size, length - 1), length - 2, state, words)
@@ -403,7 +403,7 @@ def _read_integers(words, modes, values, contexts):  # type: ignore[no-untyped-d
                 second, state = rc.decode_bit(context, context, contexts, state, words)
                 rest, state = rc.decode_plain(length - 2, state, words)
                 size = ((uint64(2) | uint64(second)) << uint64(length - 2)) | rest
-            value = (-np.int64(size) if sign else np.int64(size)) + _expected(values, i, i - 1, j, modes[j])
+            value = (-int64(size) if sign else int64(size)) + _expected(values, i, i - 1, j, modes[j])
             if size >= uint64(2 * _TOO_LARGE) or not -_TOO_LARGE < value < _TOO_LARGE:
                 return _OUTSIDE
             values[i, j] = value

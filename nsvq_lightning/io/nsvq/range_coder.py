@@ -10,7 +10,7 @@ little and follows quickly, by 1/8.
 """
 
 import numpy as np
-from numba import uint32, uint64
+from numba import int64, uint32, uint64
 
 from nsvq_lightning.compute.jit import inline
 from nsvq_lightning.splats.conventions import Uint32s
@@ -47,9 +47,9 @@ _MIN_CHANCE = 48
 @inline
 def _learn(bit, context, contexts, limit):
     """Move the probability towards the bit; without branches, which would be unpredictable."""
-    n = np.int64(contexts[context] & uint32(255))
-    chance = np.int64(contexts[context] >> uint32(8))
-    target = _MIN_CHANCE + np.int64(bit) * (65536 - 2 * _MIN_CHANCE)
+    n = int64(contexts[context] & uint32(255))
+    chance = int64(contexts[context] >> uint32(8))
+    target = _MIN_CHANCE + int64(bit) * (65536 - 2 * _MIN_CHANCE)
     chance += ((target - chance) * _RATES[n]) >> 16
     contexts[context] = uint32((chance << 8) + n + (n < limit))
 
@@ -154,7 +154,7 @@ def decode_bit(context, quick, contexts, state, words):
     """Read a bit; returns it and the new state."""
     code, width, used = state
     part = (width >> uint64(16)) * _chance(context, quick, contexts)
-    bit = np.int64(code < part)
+    bit = int64(code < part)
     one = uint64(0) - uint64(bit)
     code -= part & ~one
     width = (part & one) | ((width - part) & ~one)
