@@ -34,7 +34,7 @@ def _loader(columns, load):
         if count < 16:
             padded = simd.scratch(64)
             for k in range(columns * count):
-                simd.put(padded, k, simd.get(rows, columns * start + k))
+                put(padded, k, get(rows, columns * start + k))
             return load(padded, 0)
         return load(rows, columns * start)
 

@@ -15,6 +15,7 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat, flat_checked, recycled
 from nsvq_lightning.compute.rows import clear, share
+from nsvq_lightning.compute.simd import fma, get, load, put, store
 from nsvq_lightning.quality import formulas
 from nsvq_lightning.quality.formulas import DERIVATIVES, MOMENTS, SSIM_RADIUS, check_pair, ssim_window
 
@@ -42,17 +43,17 @@ def take_row(image, target, white, images, y, height, length, pitch):
         for x_ in range(0, length, 16):
             # The last vector of a row overlaps the one before it instead of running past the end.
             x = min(x_, length - 16)
-            simd.store(images, o + x, formulas.clamped(simd.load(image, y * length + x)))
+            store(images, o + x, formulas.clamped(load(image, y * length + x)))
         for x in range(length):
-            simd.put(images, o + pitch + x, F(simd.get(target, y * length + x)) / white)
+            put(images, o + pitch + x, F(get(target, y * length + x)) / white)
 
 
 @inline
 def blur_along(row, o):
     """Eleven taps along a padded row of interleaved RGB (neighbouring pixels are 3 floats apart)."""
-    total = TAPS[0] * simd.load(row, o)
+    total = TAPS[0] * load(row, o)
     for k in range(1, SSIM_RADIUS + 1):
-        total = simd.fma(TAPS[k], simd.load(row, o - 3 * k) + simd.load(row, o + 3 * k), total)
+        total = fma(TAPS[k], load(row, o - 3 * k) + load(row, o + 3 * k), total)
     return total
 
 
@@ -62,23 +63,23 @@ def moments_of_row(images, y, length, pitch, moments):
     for x_ in range(0, length, 16):
         x = min(x_, length - 16)
         o = row_of(y, IMAGES, pitch) + x
-        sums = formulas.moments(TAPS[0], simd.load(images, o), simd.load(images, o + pitch))
+        sums = formulas.moments(TAPS[0], load(images, o), load(images, o + pitch))
         for distance in range(1, SSIM_RADIUS + 1):
             # The rows above and below share a tap.
             above = row_of(y - distance, IMAGES, pitch) + x
             below = row_of(y + distance, IMAGES, pitch) + x
-            p, q = simd.load(images, above), simd.load(images, above + pitch)
-            r, s = simd.load(images, below), simd.load(images, below + pitch)
+            p, q = load(images, above), load(images, above + pitch)
+            r, s = load(images, below), load(images, below + pitch)
             sums = formulas.add_moments(sums, TAPS[distance], p, q, r, s)
         for plane in range(MOMENTS):
-            simd.store(moments, plane * pitch + PAD + x, sums[plane])
+            store(moments, plane * pitch + PAD + x, sums[plane])
 
 
 @inline
 def similarity_of_row(moments, derivatives, length, pitch, lanes):
     """Sum of SSIM over a row; its derivatives with respect to blurred p, p² and pq go into three padded rows."""
     total = simd.broadcast(0)
-    lane = simd.load(lanes, 0)
+    lane = load(lanes, 0)
     for x_ in range(0, length, 16):
         x = min(x_, length - 16)
         o = PAD + x
@@ -86,7 +87,7 @@ def similarity_of_row(moments, derivatives, length, pitch, lanes):
         squares, product = blur_along(moments, 2 * pitch + o), blur_along(moments, 3 * pitch + o)
         similarity, slopes = formulas.similarity(m1, m2, squares, product)
         for plane in range(DERIVATIVES):
-            simd.store(derivatives, plane * pitch + o, slopes[plane])
+            store(derivatives, plane * pitch + o, slopes[plane])
         total = total + simd.where(lane >= F(x_ - x), similarity, 0)
     return simd.lane_sum(total)
 
@@ -95,10 +96,10 @@ def similarity_of_row(moments, derivatives, length, pitch, lanes):
 def blur_across(ring, y, plane, x, pitch):
     """Eleven taps down the ring buffer, centred on row y, of one derivative plane."""
     o = plane * pitch + x
-    total = TAPS[0] * simd.load(ring, row_of(y, DERIVATIVES, pitch) + o)
+    total = TAPS[0] * load(ring, row_of(y, DERIVATIVES, pitch) + o)
     for distance in range(1, SSIM_RADIUS + 1):
         above, below = row_of(y - distance, DERIVATIVES, pitch), row_of(y + distance, DERIVATIVES, pitch)
-        total = simd.fma(TAPS[distance], simd.load(ring, above + o) + simd.load(ring, below + o), total)
+        total = fma(TAPS[distance], load(ring, above + o) + load(ring, below + o), total)
     return total
 
 
@@ -106,16 +107,15 @@ def blur_across(ring, y, plane, x, pitch):
 def gradient_of_row(image, gradient, images, ring, y, length, pitch, steps, lanes):
     """Gradient of the loss at row y, 0 where the image was clamped; returns the row's sum of absolute differences."""
     total = simd.broadcast(0)
-    lane = simd.load(lanes, 0)
+    lane = load(lanes, 0)
     for x_ in range(0, length, 16):
         x = min(x_, length - 16)
         o = row_of(y, IMAGES, pitch) + x
-        p, q = simd.load(images, o), simd.load(images, o + pitch)
-        raw = simd.load(image, y * length + x)
+        p, q = load(images, o), load(images, o + pitch)
+        raw = load(image, y * length + x)
         o = PAD + x
         slopes = blur_across(ring, y, 0, o, pitch), blur_across(ring, y, 1, o, pitch), blur_across(ring, y, 2, o, pitch)
-        g = formulas.pixel_gradient(raw, p, q, slopes, steps)
-        simd.store(gradient, y * length + x, g)
+        store(gradient, y * length + x, formulas.pixel_gradient(raw, p, q, slopes, steps))
         total = total + simd.where(lane >= F(x_ - x), simd.abs(p - q), 0)
     return simd.lane_sum(total)
 
@@ -123,15 +123,15 @@ def gradient_of_row(image, gradient, images, ring, y, length, pitch, steps, lane
 @parallel
 def square_errors(thread, threads, image, target, white, height, length, pitch, images, lanes, sums):
     """Every thread adds up the squared differences of each row of a band, into ``sums[2·y]``."""
-    own_images, lane = images[thread], simd.load(lanes, 0)
+    own_images, lane = images[thread], load(lanes, 0)
     for y in range(*share(height, thread, threads)):
         take_row(image, target, white, own_images, y, height, length, pitch)
         total = simd.broadcast(0)
         for x_ in range(0, length, 16):
             x = min(x_, length - 16)
             o = row_of(y, IMAGES, pitch) + x
-            difference = simd.load(own_images, o) - simd.load(own_images, o + pitch)
-            total = simd.fma(difference, simd.where(lane >= F(x_ - x), difference, 0), total)
+            difference = load(own_images, o) - load(own_images, o + pitch)
+            total = fma(difference, simd.where(lane >= F(x_ - x), difference, 0), total)
         sums[2 * y] = simd.lane_sum(total)
 
 
@@ -162,7 +162,7 @@ def sweep_image(
             for plane in range(DERIVATIVES):
                 for x_ in range(0, length, 16):
                     x = plane * pitch + PAD + min(x_, length - 16)
-                    simd.store(own_ring, slot + x, blur_along(own_derivatives, x))
+                    store(own_ring, slot + x, blur_along(own_derivatives, x))
         done = y - SSIM_RADIUS
         if done >= first:
             sums[2 * done + 1] = gradient_of_row(

@@ -20,6 +20,7 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import INT32, INT64, Array, aligned_empty, check_array, check_inside, check_table
 from nsvq_lightning.compute.rows import count_outside
+from nsvq_lightning.compute.simd import fma, get, integer, load, put, store
 
 # Factor on the bounds, far above the relative rounding error of a float32 distance.
 ROUNDING = 1.0 + 1e-5
@@ -107,11 +108,11 @@ def _box_distances(dim, boxes, at, x, row):
     """Squared distances of a query to 16 boxes."""
     total = simd.broadcast(0)
     for j in range(dim):
-        value = simd.get(x, row + j)
-        below = simd.load(boxes, at + 32 * j) - value
-        above = value - simd.load(boxes, at + 32 * j + 16)
+        value = get(x, row + j)
+        below = load(boxes, at + 32 * j) - value
+        above = value - load(boxes, at + 32 * j + 16)
         gap = simd.maximum(simd.maximum(below, above), 0)
-        total = simd.fma(gap, gap, total)
+        total = fma(gap, gap, total)
     return total
 
 
@@ -120,8 +121,8 @@ def code_distances(dim, codes, at, x, row):
     """Squared distances of a query to 16 codes, whose columns follow each other."""
     total = simd.broadcast(0)
     for j in range(dim):
-        difference = simd.load(codes, at + 16 * j) - simd.get(x, row + j)
-        total = simd.fma(difference, difference, total)
+        difference = load(codes, at + 16 * j) - get(x, row + j)
+        total = fma(difference, difference, total)
     return total
 
 
@@ -133,18 +134,18 @@ def _visit_leaf(dim, tree, leaf, x, i, limit, state):
     distances = code_distances(dim, codes, leaf * dim * 16, x, i * dim)
     bits = simd.mask_bits(distances <= limit)
     if bits != 0:
-        simd.store(scratch, 0, distances)
+        store(scratch, 0, distances)
         while bits != 0:
             lane = simd.lowest_bit(bits)
             bits &= bits - 1
-            distance, code = simd.get(scratch, lane), simd.get(labels, leaf * 16 + lane)
-            smallest = simd.get(best, i)
-            if distance < smallest or (distance == smallest and code < simd.get(label, i)):
-                simd.put(second, i, smallest)
-                simd.put(best, i, distance)
-                simd.put(label, i, code)
-            elif distance < simd.get(second, i):
-                simd.put(second, i, distance)
+            distance, code = get(scratch, lane), get(labels, leaf * 16 + lane)
+            smallest = get(best, i)
+            if distance < smallest or (distance == smallest and code < get(label, i)):
+                put(second, i, smallest)
+                put(best, i, distance)
+                put(label, i, code)
+            elif distance < get(second, i):
+                put(second, i, distance)
 
 
 @inline
@@ -173,12 +174,12 @@ def _prove(dim, codebook, x, row, code, memory, travelled):
     _, anchors, clearance = memory
     moved = distance = F(0.0)
     for j in range(dim):
-        value = simd.get(x, row * dim + j)
-        from_anchor, from_code = value - simd.get(anchors, row * dim + j), value - simd.get(codebook, code * dim + j)
+        value = get(x, row * dim + j)
+        from_anchor, from_code = value - get(anchors, row * dim + j), value - get(codebook, code * dim + j)
         moved += from_anchor * from_anchor
         distance += from_code * from_code
     way = (np.float64(np.sqrt(distance)) + np.float64(np.sqrt(moved))) * ROUNDING
-    return way < simd.get(clearance, row) - travelled
+    return way < get(clearance, row) - travelled
 
 
 @inline
@@ -187,21 +188,21 @@ def _guess(dim, tree, x, count, state):
     codes, _, leaves, nodes = tree
     best, label, second, guess, _, _, bounded = state
     for i in range(count):
-        simd.put(guess, i, _nearest_node(dim, nodes, x, i * dim))
+        put(guess, i, _nearest_node(dim, nodes, x, i * dim))
     for i in range(count):
-        node = simd.get(guess, i)
+        node = get(guess, i)
         distances = _box_distances(dim, leaves, node * 32 * dim, x, i * dim)
         lane = simd.lowest_bit(simd.mask_bits(distances <= simd.lane_min(distances)))
-        simd.put(guess, i, node * 16 + lane)
+        put(guess, i, node * 16 + lane)
     for i in range(count):
-        leaf = simd.get(guess, i)
+        leaf = get(guess, i)
         distances = code_distances(dim, codes, leaf * dim * 16, x, i * dim)
         limit = simd.lane_min(distances)
         if bounded:
             limit = simd.lane_min(simd.where(distances > limit, distances, np.inf))
-        simd.put(best, i, np.inf)
-        simd.put(label, i, _NO_CODE)
-        simd.put(second, i, np.inf)
+        put(best, i, np.inf)
+        put(label, i, _NO_CODE)
+        put(second, i, np.inf)
         _visit_leaf(dim, tree, leaf, x, i, limit, state)
 
 
@@ -209,7 +210,7 @@ def _guess(dim, tree, x, count, state):
 def _limit(i, state):
     """Distance beyond which no code matters: the best so far, or the second-best if that is needed."""
     best, _, second, _, _, _, bounded = state
-    return simd.get(second, i) if bounded else simd.get(best, i)
+    return get(second, i) if bounded else get(best, i)
 
 
 @inline
@@ -217,7 +218,7 @@ def _visit_leaves(dim, tree, x, state, pending):
     """Visit the pending (query, leaf) pairs."""
     tasks = state[4]
     for t in range(pending):
-        i, leaf = simd.get(tasks, 2 * t), simd.get(tasks, 2 * t + 1)
+        i, leaf = get(tasks, 2 * t), get(tasks, 2 * t + 1)
         _visit_leaf(dim, tree, leaf, x, i, _limit(i, state), state)
 
 
@@ -238,9 +239,9 @@ def _visit_near(dim, tree, x, count, state):
                 while near_leaves != 0:
                     leaf = node * 16 + simd.lowest_bit(near_leaves)
                     near_leaves &= near_leaves - 1
-                    simd.put(tasks, 2 * pending, i)
-                    simd.put(tasks, 2 * pending + 1, leaf)
-                    pending += leaf != simd.get(guess, i)
+                    put(tasks, 2 * pending, i)
+                    put(tasks, 2 * pending + 1, leaf)
+                    pending += leaf != get(guess, i)
                 if pending > _TASKS - 16:
                     _visit_leaves(dim, tree, x, state, pending)
                     pending = 0
@@ -265,32 +266,32 @@ def _search_kernel(dim: int) -> Any:
             return found_outside
         count = 0
         for i in range(first, stop):
-            row, proven = simd.get(rows, i), False
+            row, proven = get(rows, i), False
             if bounded:
-                code = simd.integer(last_codes, row)
-                simd.put(result, i, code)
+                code = integer(last_codes, row)
+                put(result, i, code)
                 known = code >= 0 and code < codebook.shape[0] // dim
                 proven = known and _prove(dim, codebook, x, row, code, memory, travelled)
             if not proven:
-                simd.put(places, count, i)
+                put(places, count, i)
                 for j in range(dim):
-                    simd.put(queries, count * dim + j, simd.get(x, row * dim + j))
+                    put(queries, count * dim + j, get(x, row * dim + j))
                 count += 1
         _guess(dim, tree, queries, count, state)
         _visit_near(dim, tree, queries, count, state)
         for i in range(count):
-            place, nearest = simd.get(places, i), simd.get(label, i)
+            place, nearest = get(places, i), get(label, i)
             if nearest == _NO_CODE:
                 nearest = np.int32(0)
-            simd.put(result, place, nearest)
+            put(result, place, nearest)
             if bounded:
-                row = simd.get(rows, place)
-                simd.put(last_codes, row, nearest)
+                row = get(rows, place)
+                put(last_codes, row, nearest)
                 for j in range(dim):
-                    simd.put(anchors, row * dim + j, simd.get(queries, i * dim + j))
+                    put(anchors, row * dim + j, get(queries, i * dim + j))
                 # There may still be codes beyond the largest float32 number.
-                away = np.float64(min(simd.get(second, i), largest))
-                simd.put(clearance, row, np.sqrt(away) / ROUNDING + travelled)
+                away = np.float64(min(get(second, i), largest))
+                put(clearance, row, np.sqrt(away) / ROUNDING + travelled)
         return 0
 
     return parallel(search)

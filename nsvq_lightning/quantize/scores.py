@@ -16,6 +16,7 @@ import numpy as np
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import FLOAT32, Array, aligned_empty, check_array, check_table
+from nsvq_lightning.compute.simd import fma, fnma, get, integer, load, put, store
 
 # Codes in the list of a row.
 LIST = 8
@@ -53,8 +54,8 @@ def closer(dim, x, row, codebook, code, distance, candidate):
     """
     total = simd.broadcast(0)
     for j in range(dim):
-        difference = simd.get(codebook, candidate * dim + j) - simd.get(x, row * dim + j)
-        total = simd.fma(difference, difference, total)
+        difference = get(codebook, candidate * dim + j) - get(x, row * dim + j)
+        total = fma(difference, difference, total)
     candidate_distance = simd.lane_min(total)
     if candidate_distance < distance or (candidate_distance == distance and candidate < code):
         return candidate, candidate_distance
@@ -77,15 +78,15 @@ def squares(dim, a, at_a, b, at_b, keep):
     total = simd.broadcast(0)
     if dim < 16:
         for j in range(dim):
-            difference = (simd.get(a, at_a + j) - simd.get(b, at_b + j)) * simd.load(keep, 0)
-            total = simd.fma(difference, difference, total)
+            difference = (get(a, at_a + j) - get(b, at_b + j)) * load(keep, 0)
+            total = fma(difference, difference, total)
         return total
     for j in range(0, dim // 16 * 16, 16):
-        difference = simd.load(a, at_a + j) - simd.load(b, at_b + j)
-        total = simd.fma(difference, difference, total)
+        difference = load(a, at_a + j) - load(b, at_b + j)
+        total = fma(difference, difference, total)
     if dim % 16:
-        difference = (simd.load(a, at_a + dim - 16) - simd.load(b, at_b + dim - 16)) * simd.load(keep, 0)
-        total = simd.fma(difference, difference, total)
+        difference = (load(a, at_a + dim - 16) - load(b, at_b + dim - 16)) * load(keep, 0)
+        total = fma(difference, difference, total)
     return total
 
 
@@ -97,12 +98,12 @@ _CHUNK = 4  # blocks of 32 codes in a chunk
 def _insert(scores, codes, at, kept, score, code):
     """Insert a score into the sorted scores of a row; the last one drops out."""
     place = at + kept - 1
-    while place > at and simd.get(scores, place - 1) > score:
-        simd.put(scores, place, simd.get(scores, place - 1))
-        simd.put(codes, place, simd.get(codes, place - 1))
+    while place > at and get(scores, place - 1) > score:
+        put(scores, place, get(scores, place - 1))
+        put(codes, place, get(codes, place - 1))
         place -= 1
-    simd.put(scores, place, score)
-    simd.put(codes, place, code)
+    put(scores, place, score)
+    put(codes, place, code)
 
 
 @inline
@@ -110,43 +111,43 @@ def _keep(kept, first, block, state):
     """Of the scores ``found`` of a block, insert those below the limits of 6 rows."""
     scores, codes, limits, slack, found = state
     for i in range(_GROUP):
-        limit = simd.get(limits, first + i)
-        low, high = simd.load(found, 32 * i), simd.load(found, 32 * i + 16)
+        limit = get(limits, first + i)
+        low, high = load(found, 32 * i), load(found, 32 * i + 16)
         below = simd.mask_bits(low < limit) | (simd.mask_bits(high < limit) << 16)
         while below != 0:
             lane = simd.lowest_bit(below)
             below &= below - 1
-            score, at = simd.get(found, 32 * i + lane), (first + i) * _BEST
-            if score < simd.get(limits, first + i):
+            score, at = get(found, 32 * i + lane), (first + i) * _BEST
+            if score < get(limits, first + i):
                 _insert(scores, codes, at, kept, score, np.int32(block * 32 + lane))
-                last, reach = simd.get(scores, at + kept - 1), simd.get(scores, at) + simd.get(slack, first + i)
-                simd.put(limits, first + i, min(last, reach))
+                last, reach = get(scores, at + kept - 1), get(scores, at) + get(slack, first + i)
+                put(limits, first + i, min(last, reach))
 
 
 @inline
 def _subtract(sums, value, low, high):
-    return simd.fnma(value, low, sums[0]), simd.fnma(value, high, sums[1])
+    return fnma(value, low, sums[0]), fnma(value, high, sums[1])
 
 
 @inline
 def _below(sums, limits, row):
-    return simd.minimum(sums[0], sums[1]) < simd.get(limits, row)
+    return simd.minimum(sums[0], sums[1]) < get(limits, row)
 
 
 @inline
 def _score_block(dim, blocks, halves, block, rows, first, kept, state):
     """Scores of 6 rows against 32 codes: 12 sums that hide each other's latency."""
     _, _, limits, _, found = state
-    s0 = s1 = s2 = s3 = s4 = s5 = simd.load(halves, block * 32), simd.load(halves, block * 32 + 16)
+    s0 = s1 = s2 = s3 = s4 = s5 = load(halves, block * 32), load(halves, block * 32 + 16)
     for j in range(dim):
         at, row = (block * dim + j) * 32, first * dim + j
-        low, high = simd.load(blocks, at), simd.load(blocks, at + 16)
-        s0 = _subtract(s0, simd.get(rows, row), low, high)
-        s1 = _subtract(s1, simd.get(rows, row + dim), low, high)
-        s2 = _subtract(s2, simd.get(rows, row + 2 * dim), low, high)
-        s3 = _subtract(s3, simd.get(rows, row + 3 * dim), low, high)
-        s4 = _subtract(s4, simd.get(rows, row + 4 * dim), low, high)
-        s5 = _subtract(s5, simd.get(rows, row + 5 * dim), low, high)
+        low, high = load(blocks, at), load(blocks, at + 16)
+        s0 = _subtract(s0, get(rows, row), low, high)
+        s1 = _subtract(s1, get(rows, row + dim), low, high)
+        s2 = _subtract(s2, get(rows, row + 2 * dim), low, high)
+        s3 = _subtract(s3, get(rows, row + 3 * dim), low, high)
+        s4 = _subtract(s4, get(rows, row + 4 * dim), low, high)
+        s5 = _subtract(s5, get(rows, row + 5 * dim), low, high)
     below = (
         _below(s0, limits, first)
         | _below(s1, limits, first + 1)
@@ -158,20 +159,20 @@ def _score_block(dim, blocks, halves, block, rows, first, kept, state):
     if simd.mask_bits(below) != 0:
         sums = s0 + s1 + s2 + s3 + s4 + s5
         for k in range(12):
-            simd.store(found, 16 * k, sums[k])
+            store(found, 16 * k, sums[k])
         _keep(kept, first, block, state)
 
 
 @inline
 def _settle(dim, x, row, codebook, scores, codes, at, kept, limit):
     """Nearest code by true distance among those with a score up to ``limit``."""
-    code = simd.integer(codes, at)
-    if simd.get(scores, at + 1) > limit:
+    code = integer(codes, at)
+    if get(scores, at + 1) > limit:
         return code
     distance = F(np.inf)
     for place in range(at, at + kept):
-        if simd.get(scores, place) <= limit:
-            code, distance = closer(dim, x, row, codebook, code, distance, simd.integer(codes, place))
+        if get(scores, place) <= limit:
+            code, distance = closer(dim, x, row, codebook, code, distance, integer(codes, place))
     return code
 
 

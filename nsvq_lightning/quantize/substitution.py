@@ -24,6 +24,7 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import check_inside, check_tensor, flat, recycled
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside, share
+from nsvq_lightning.compute.simd import fma, get, load, put, store
 from nsvq_lightning.quantize.scores import new_lanes
 
 _UNIT, _TINY, _MINUS_TWO_LN2 = F(2.0**-24), np.finfo(np.float32).tiny, F(-2 * np.log(2))
@@ -32,9 +33,9 @@ _ROWS = 256  # rows per unit of parallel work; the noise of a row depends only o
 
 @inline
 def _polynomial(c, t):
-    value = simd.fma(c[0], t, c[1])
-    value = simd.fma(simd.fma(value, t, c[2]), t, c[3])
-    return simd.fma(simd.fma(value, t, c[4]), t, c[5])
+    value = fma(c[0], t, c[1])
+    value = fma(fma(value, t, c[2]), t, c[3])
+    return fma(fma(value, t, c[4]), t, c[5])
 
 
 MULTIPLIERS = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
@@ -56,8 +57,8 @@ def _uniforms(seed, pair, out, at):
         bits = (bits ^ (bits >> np.uint64(30))) * _FIRST
         bits = (bits ^ (bits >> np.uint64(27)) ^ second_key) * _SECOND
         bits = bits ^ (bits >> np.uint64(31))
-        simd.put(out, at + lane, F(np.int32(bits >> np.uint64(40)) + np.int32(1)) * _UNIT)
-        simd.put(out, at + 16 + lane, F(np.int32(bits & np.uint64(0xFFFFFF))) * _UNIT - F(0.5))
+        put(out, at + lane, F(np.int32(bits >> np.uint64(40)) + np.int32(1)) * _UNIT)
+        put(out, at + 16 + lane, F(np.int32(bits & np.uint64(0xFFFFFF))) * _UNIT - F(0.5))
 
 
 @inline
@@ -66,10 +67,10 @@ def fill_normal(seed, first, count, out):
     for pair in range(count // 2):
         at = pair * 32
         _uniforms(seed, (first // 2 + pair) * 16, out, at)
-        length = simd.sqrt(simd.log2(simd.load(out, at)) * _MINUS_TWO_LN2)
-        turn = simd.load(out, at + 16)
-        simd.store(out, at, length * _polynomial(_COS, turn * turn))
-        simd.store(out, at + 16, length * (turn * _polynomial(_SIN, turn * turn)))
+        length = simd.sqrt(simd.log2(load(out, at)) * _MINUS_TWO_LN2)
+        turn = load(out, at + 16)
+        store(out, at, length * _polynomial(_COS, turn * turn))
+        store(out, at + 16, length * (turn * _polynomial(_SIN, turn * turn)))
 
 
 @inline
@@ -82,7 +83,7 @@ def _new_group(dim):
 def _take_row(dim, source, start, lane, group):
     """Copy a row into one lane of vectors."""
     for j in range(dim):
-        simd.put(group, j * 16 + lane, simd.get(source, start + j))
+        put(group, j * 16 + lane, get(source, start + j))
 
 
 @inline
@@ -106,22 +107,22 @@ def _short_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin,
     for first in range(begin, stop, 16):
         valid = min(16, stop - first)
         for lane in range(valid):
-            _take_row(dim, x, simd.get(rows, first + lane) * dim, lane, values)
-            _take_row(dim, codebook, simd.get(codes, first + lane) * dim, lane, chosen)
+            _take_row(dim, x, get(rows, first + lane) * dim, lane, values)
+            _take_row(dim, codebook, get(codes, first + lane) * dim, lane, chosen)
         at = (first - begin) * dim
         error = squared = simd.broadcast(0)
         for j in range(dim):
-            residual = simd.load(chosen, 16 * j) - simd.load(values, 16 * j)
-            direction = simd.fma(aim, residual, spread * simd.load(noise, at + 16 * j))
-            simd.store(noise, at + 16 * j, direction)
-            error = simd.fma(residual, residual, error)
-            squared = simd.fma(direction, direction, squared)
+            residual = load(chosen, 16 * j) - load(values, 16 * j)
+            direction = fma(aim, residual, spread * load(noise, at + 16 * j))
+            store(noise, at + 16 * j, direction)
+            error = fma(residual, residual, error)
+            squared = fma(direction, direction, squared)
         length = simd.sqrt(error * _inverses(squared))
         for j in range(dim):
-            simd.store(values, 16 * j, simd.fma(length, simd.load(noise, at + 16 * j), simd.load(values, 16 * j)))
+            store(values, 16 * j, fma(length, load(noise, at + 16 * j), load(values, 16 * j)))
         for lane in range(valid):
             for j in range(dim):
-                simd.put(out, (first + lane) * dim + j, simd.get(values, j * 16 + lane))
+                put(out, (first + lane) * dim + j, get(values, j * 16 + lane))
 
 
 @inline
@@ -133,22 +134,21 @@ def _long_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, 
         start = i % 2 * vectors * 16
         if start == 0:
             fill_normal(seed, i * vectors, 2 * vectors, noise)
-        at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
+        at, code = get(rows, i) * dim, get(codes, i) * dim
         error = squared = simd.broadcast(0)
         for j in range(vectors):
             place = min(16 * j, dim - 16)
-            residual = simd.load(codebook, code + place) - simd.load(x, at + place)
-            way = simd.fma(aim, residual, spread * simd.load(noise, start + place))
-            simd.store(direction, place, way)
+            residual = load(codebook, code + place) - load(x, at + place)
+            way = fma(aim, residual, spread * load(noise, start + place))
+            store(direction, place, way)
             if j == vectors - 1:
-                residual, way = residual * simd.load(keep, 0), way * simd.load(keep, 0)
-            error = simd.fma(residual, residual, error)
-            squared = simd.fma(way, way, squared)
+                residual, way = residual * load(keep, 0), way * load(keep, 0)
+            error = fma(residual, residual, error)
+            squared = fma(way, way, squared)
         length = simd.sqrt(simd.lane_sum(error) * _inverses(simd.broadcast(simd.lane_sum(squared))))
         for j in range(vectors):
             place = min(16 * j, dim - 16)
-            moved = simd.fma(length, simd.load(direction, place), simd.load(x, at + place))
-            simd.store(out, i * dim + place, moved)
+            store(out, i * dim + place, fma(length, load(direction, place), load(x, at + place)))
 
 
 @cache
@@ -174,28 +174,28 @@ def _short_backward(dim, grad, x, rows, codebook, codes, out, grad_x, sums, begi
         valid = min(16, stop - first)
         for lane in range(valid):
             i = first + lane
-            _take_row(dim, x, simd.get(rows, i) * dim, lane, values)
-            _take_row(dim, codebook, simd.get(codes, i) * dim, lane, chosen)
+            _take_row(dim, x, get(rows, i) * dim, lane, values)
+            _take_row(dim, codebook, get(codes, i) * dim, lane, chosen)
             _take_row(dim, out, i * dim, lane, moved)
             _take_row(dim, grad, i * dim, lane, slope)
         dots = squared = simd.broadcast(0)
         for j in range(dim):
-            value = simd.load(values, 16 * j)
-            dots = simd.fma(simd.load(slope, 16 * j), simd.load(moved, 16 * j) - value, dots)
-            residual = value - simd.load(chosen, 16 * j)
-            squared = simd.fma(residual, residual, squared)
+            value = load(values, 16 * j)
+            dots = fma(load(slope, 16 * j), load(moved, 16 * j) - value, dots)
+            residual = value - load(chosen, 16 * j)
+            squared = fma(residual, residual, squared)
         scale = dots * _inverses(squared)
         for j in range(dim):
-            radial = scale * (simd.load(values, 16 * j) - simd.load(chosen, 16 * j))
-            simd.store(chosen, 16 * j, radial)
-            simd.store(slope, 16 * j, simd.load(slope, 16 * j) + radial)
+            radial = scale * (load(values, 16 * j) - load(chosen, 16 * j))
+            store(chosen, 16 * j, radial)
+            store(slope, 16 * j, load(slope, 16 * j) + radial)
         for lane in range(valid):
             i = first + lane
             clear_between(rows, i, dim, grad_x)
-            at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
+            at, code = get(rows, i) * dim, get(codes, i) * dim
             for j in range(dim):
-                simd.put(grad_x, at + j, simd.get(slope, j * 16 + lane))
-                simd.put(sums, code + j, simd.get(sums, code + j) - simd.get(chosen, j * 16 + lane))
+                put(grad_x, at + j, get(slope, j * 16 + lane))
+                put(sums, code + j, get(sums, code + j) - get(chosen, j * 16 + lane))
 
 
 @inline
@@ -203,26 +203,26 @@ def _long_backward(dim, grad, x, rows, codebook, codes, out, grad_x, sums, begin
     vectors = (dim + 15) // 16
     keep = new_lanes(dim)
     for i in range(begin, stop):
-        at, code = simd.get(rows, i) * dim, simd.get(codes, i) * dim
+        at, code = get(rows, i) * dim, get(codes, i) * dim
         dots = squared = simd.broadcast(0)
         for j in range(vectors):
             place = min(16 * j, dim - 16)
-            value, slope = simd.load(x, at + place), simd.load(grad, i * dim + place)
-            residual = value - simd.load(codebook, code + place)
+            value, slope = load(x, at + place), load(grad, i * dim + place)
+            residual = value - load(codebook, code + place)
             if j == vectors - 1:
-                residual, slope = residual * simd.load(keep, 0), slope * simd.load(keep, 0)
-            dots = simd.fma(slope, simd.load(out, i * dim + place) - value, dots)
-            squared = simd.fma(residual, residual, squared)
+                residual, slope = residual * load(keep, 0), slope * load(keep, 0)
+            dots = fma(slope, load(out, i * dim + place) - value, dots)
+            squared = fma(residual, residual, squared)
         scale = simd.lane_sum(dots) * _inverses(simd.broadcast(simd.lane_sum(squared)))
         clear_between(rows, i, dim, grad_x)
         # The last two vectors overlap, so the last sums are read before any are written.
-        last = simd.load(sums, code + dim - 16)
+        last = load(sums, code + dim - 16)
         for j in range(vectors):
             place = min(16 * j, dim - 16)
-            radial = scale * (simd.load(x, at + place) - simd.load(codebook, code + place))
-            simd.store(grad_x, at + place, simd.load(grad, i * dim + place) + radial)
-            before = last if j == vectors - 1 else simd.load(sums, code + place)
-            simd.store(sums, code + place, before - radial)
+            radial = scale * (load(x, at + place) - load(codebook, code + place))
+            store(grad_x, at + place, load(grad, i * dim + place) + radial)
+            before = last if j == vectors - 1 else load(sums, code + place)
+            store(sums, code + place, before - radial)
 
 
 @cache

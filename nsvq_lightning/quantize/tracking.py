@@ -20,6 +20,7 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import INT64, Array, check_array
+from nsvq_lightning.compute.simd import get, integer, load, put, store
 from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, box_search, sort_into_leaves
 from nsvq_lightning.quantize.nearest import check_rows, nearest
 from nsvq_lightning.quantize.scores import LIST, closer, new_lanes, score_search, squares
@@ -32,7 +33,7 @@ def _list_squared(dim, x, at, codebook, lists, start, keep):
     """Squared distances to the codes of a list, one per lane; the other lanes hold 0."""
 
     def member(k):
-        return squares(dim, x, at, codebook, simd.integer(lists, start + k) * dim, keep)
+        return squares(dim, x, at, codebook, integer(lists, start + k) * dim, keep)
 
     return simd.lane_sums((member(0), member(1), member(2), member(3), member(4), member(5), member(6), member(7)))
 
@@ -40,12 +41,12 @@ def _list_squared(dim, x, at, codebook, lists, start, keep):
 @inline
 def _settle(dim, x, row, codebook, lists, start, near):
     """Nearest code by true distance among the members of a list whose bits are set."""
-    code = simd.integer(lists, start + simd.lowest_bit(near))
+    code = integer(lists, start + simd.lowest_bit(near))
     if near & (near - 1) == 0:
         return code
     distance = F(np.inf)
     while near != 0:
-        candidate = simd.integer(lists, start + simd.lowest_bit(near))
+        candidate = integer(lists, start + simd.lowest_bit(near))
         near &= near - 1
         code, distance = closer(dim, x, row, codebook, code, distance, candidate)
     return code
@@ -61,34 +62,34 @@ def _check_kernel(dim: int) -> Any:
         unused, scratch = np.zeros(16, np.float32), np.empty(16, np.float32)
         unused[LIST:] = np.inf
         for i in range(block * _BLOCK, min(rows.shape[0], (block + 1) * _BLOCK)):
-            row = simd.get(rows, i)
-            at, start, code = row * dim, row * LIST, simd.integer(last, row)
-            simd.put(result, i, np.int64(-1))
+            row = get(rows, i)
+            at, start, code = row * dim, row * LIST, integer(last, row)
+            put(result, i, np.int64(-1))
             if code < 0:
                 continue
             moved = np.float64(np.sqrt(simd.lane_sum(squares(dim, x, at, anchors, at, keep)))) * ROUNDING
             distance = np.sqrt(simd.lane_sum(squares(dim, x, at, codebook, code * dim, keep)))
-            if np.float64(distance) * ROUNDING + moved < simd.get(clearance, row) - way:
-                simd.put(result, i, code)
+            if np.float64(distance) * ROUNDING + moved < get(clearance, row) - way:
+                put(result, i, code)
                 continue
-            squared = _list_squared(dim, x, at, codebook, lists, start, keep) + simd.load(unused, 0)
+            squared = _list_squared(dim, x, at, codebook, lists, start, keep) + load(unused, 0)
             best = simd.lane_min(squared)
             distance = np.sqrt(best)
-            if np.float64(distance) * ROUNDING + moved < simd.get(limits, row) - way:
+            if np.float64(distance) * ROUNDING + moved < get(limits, row) - way:
                 near = simd.mask_bits(squared <= best * F(ROUNDING))
                 code = _settle(dim, x, row, codebook, lists, start, near)
-                simd.put(result, i, code)
-                simd.put(last, row, np.int32(code))
-                simd.store(scratch, 0, squared)
-                simd.put(scratch, simd.lowest_bit(near), F(np.inf))
-                second = np.float64(np.sqrt(simd.lane_min(simd.load(scratch, 0))))
+                put(result, i, code)
+                put(last, row, np.int32(code))
+                store(scratch, 0, squared)
+                put(scratch, simd.lowest_bit(near), F(np.inf))
+                second = np.float64(np.sqrt(simd.lane_min(load(scratch, 0))))
                 if near & (near - 1) == 0 and second - distance > moved:
                     # The gap to the second code now exceeds how far the row has moved, so a new anchor pays.
                     for j in range(dim):
-                        simd.put(anchors, at + j, simd.get(x, at + j))
-                    limit = simd.get(limits, row) - moved
-                    simd.put(limits, row, limit)
-                    simd.put(clearance, row, min(limit, second / ROUNDING - drift + travelled))
+                        put(anchors, at + j, get(x, at + j))
+                    limit = get(limits, row) - moved
+                    put(limits, row, limit)
+                    put(clearance, row, min(limit, second / ROUNDING - drift + travelled))
 
     return parallel(check)
 

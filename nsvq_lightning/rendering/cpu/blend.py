@@ -14,6 +14,7 @@ import numpy as np
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel
 from nsvq_lightning.compute.rows import clear_between, share
+from nsvq_lightning.compute.simd import fma, fnma, get, integer, load, prefetch, put, store
 from nsvq_lightning.rendering import formulas
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.formulas import TILE, TRANSMITTANCE_MIN, TWO_LN2, dot3, exponent, fma3
@@ -49,7 +50,7 @@ BACKWARD_SCRATCH = BLOCKS * BLOCK_STATE
 @inline
 def pixels_of(grid, block):
     """Pixel centres of a block, x and y."""
-    return simd.load(grid, 16 * block), simd.load(grid, 256 + 16 * block)
+    return load(grid, 16 * block), load(grid, 256 + 16 * block)
 
 
 @inline
@@ -65,7 +66,7 @@ def in_tile(records, r, corner):
     The factors of its exponent are u = A·x + B·y + u0 and v = C·y + v0.
     """
     a, b, c = rec.get3(records, r + rec.A)
-    x, y = simd.get(records, r + rec.X) - F(corner[0]), simd.get(records, r + rec.Y) - F(corner[1])
+    x, y = get(records, r + rec.X) - F(corner[0]), get(records, r + rec.Y) - F(corner[1])
     return x, y, (a, b, c, -(a * x + b * y), -(c * y))
 
 
@@ -77,28 +78,27 @@ REACH_MARGIN = F(2.0**-8)
 @inline
 def reachable_blocks(batch, o, x, y, grid):
     """Mask of the blocks of a tile in which a splat can reach α = 1/255."""
-    left = simd.load(grid, 512) - x
-    top = simd.load(grid, 528) - y
+    left = load(grid, 512) - x
+    top = load(grid, 528) - y
     right, bottom = left + F(BLOCK_SIDE - 1), top + F(BLOCK_SIDE - 1)
     # The largest value of -(u² + v²) on a block lies on the edges that face the splat's centre.
     dx = simd.maximum(left, simd.minimum(right, 0))
     dy = simd.maximum(top, simd.minimum(bottom, 0))
-    along_y = simd.maximum(top, simd.minimum(bottom, simd.get(batch, o + rec.SLOPE_X) * dx))
-    along_x = simd.maximum(left, simd.minimum(right, simd.get(batch, o + rec.SLOPE_Y) * dy))
+    along_y = simd.maximum(top, simd.minimum(bottom, get(batch, o + rec.SLOPE_X) * dx))
+    along_x = simd.maximum(left, simd.minimum(right, get(batch, o + rec.SLOPE_Y) * dy))
     a, b, c = rec.get3(batch, o + rec.A)
     first, _, _ = exponent(a, b, c, 0, 0, 0, dx, along_y)
     second, _, _ = exponent(a, b, c, 0, 0, 0, along_x, dy)
     peak = simd.maximum(first, second)
-    return simd.mask_bits(peak >= formulas.LOG2_ALPHA_MIN - REACH_MARGIN - simd.get(batch, o + rec.LOG2_OPACITY))
+    return simd.mask_bits(peak >= formulas.LOG2_ALPHA_MIN - REACH_MARGIN - get(batch, o + rec.LOG2_OPACITY))
 
 
 @inline
 def alpha_at(batch, r, x, y):
     """α of one splat of a batch on a block of pixels, 0 below 1/255; a batch holds (u0, v0) in place of the centre."""
     a, b, c = rec.get3(batch, r + rec.A)
-    u0 = simd.get(batch, r + rec.X)
-    v0 = simd.get(batch, r + rec.Y)
-    power, _, _ = exponent(a, b, c, u0, v0, simd.get(batch, r + rec.LOG2_OPACITY), x, y)
+    u0, v0, peak = get(batch, r + rec.X), get(batch, r + rec.Y), get(batch, r + rec.LOG2_OPACITY)
+    power, _, _ = exponent(a, b, c, u0, v0, peak, x, y)
     _, alpha = formulas.alpha_of(power)
     return alpha
 
@@ -128,29 +128,29 @@ def blend_one(batch, r, alpha, t, after, kept):
     open_ = after >= TRANSMITTANCE_MIN
     weight = simd.where(open_, alpha * t, 0)
     color = fma3(weight, rec.get3(batch, r + rec.RED), color)
-    depth = simd.fma(weight, simd.get(batch, r + rec.DEPTH), depth)
+    depth = fma(weight, get(batch, r + rec.DEPTH), depth)
     return simd.where(open_, after, left), color, depth
 
 
 @inline
 def load_color(state, o):
     """Sums of colour of one block in the scratch of the forward pass."""
-    return simd.load(state, R_SUM + o), simd.load(state, G_SUM + o), simd.load(state, B_SUM + o)
+    return load(state, R_SUM + o), load(state, G_SUM + o), load(state, B_SUM + o)
 
 
 @inline
 def store_color(state, o, color):
     """The inverse of :func:`load_color`."""
     for channel in range(3):
-        simd.store(state, R_SUM + 256 * channel + o, color[channel])
+        store(state, R_SUM + 256 * channel + o, color[channel])
 
 
 @inline
 def blend_block(block, count, batch, grid, state, touched, first):
     """Blend a batch into one block; returns the block's bit, or 0 once all its pixels are closed."""
     o = 16 * block
-    t = simd.load(state, T + o)
-    kept = simd.load(state, T_LEFT + o), load_color(state, o), simd.load(state, Z_SUM + o)
+    t = load(state, T + o)
+    kept = load(state, T_LEFT + o), load_color(state, o), load(state, Z_SUM + o)
     x, y = pixels_of(grid, block)
     bit = 1 << block
     queue = waiting(touched, first, count, block), waiting(touched, first + 64, count - 64, block), np.int64(0)
@@ -162,26 +162,26 @@ def blend_block(block, count, batch, grid, state, touched, first):
         r0, r1, r2, r3 = rec.RECORD * j0, rec.RECORD * j1, rec.RECORD * j2, rec.RECORD * j3
         a0, a1 = alpha_at(batch, r0, x, y), alpha_at(batch, r1, x, y)
         a2, a3 = alpha_at(batch, r2, x, y), alpha_at(batch, r3, x, y)
-        t1 = simd.fnma(a0, t, t)
-        t2 = simd.fnma(a1, t1, t1)
-        t3 = simd.fnma(a2, t2, t2)
-        t4 = simd.fnma(a3, t3, t3)
+        t1 = fnma(a0, t, t)
+        t2 = fnma(a1, t1, t1)
+        t3 = fnma(a2, t2, t2)
+        t4 = fnma(a3, t3, t3)
         kept = blend_one(batch, r0, a0, t, t1, kept)
         kept = blend_one(batch, r1, a1, t1, t2, kept)
         kept = blend_one(batch, r2, a2, t2, t3, kept)
         kept = blend_one(batch, r3, a3, t3, t4, kept)
         if simd.mask_bits(t4 >= TRANSMITTANCE_MIN) == 0:
             for j in range(j3 + 1, count):
-                simd.put(touched, first + j, simd.get(touched, first + j) & ~bit)
+                put(touched, first + j, get(touched, first + j) & ~bit)
             bit = 0
             queue = np.int64(0), np.int64(0), np.int64(0)
         # The transmittance of closed pixels keeps falling; keep it clear of denormals.
         t = simd.maximum(t4, TINY)
-    simd.store(state, T + o, t)
+    store(state, T + o, t)
     left, color, depth = kept
-    simd.store(state, T_LEFT + o, left)
+    store(state, T_LEFT + o, left)
     store_color(state, o, color)
-    simd.store(state, Z_SUM + o, depth)
+    store(state, Z_SUM + o, depth)
     return bit
 
 
@@ -192,13 +192,13 @@ def write_block(block, corner, size, background, state, planes):
     image, transmittance, depth = planes
     o = 16 * block
     x0, y0 = block_corner(block, corner)
-    t = simd.load(state, T_LEFT + o)
+    t = load(state, T_LEFT + o)
     color = fma3(t, rec.get3(background, 0), load_color(state, o))
     if x0 + BLOCK_SIDE <= width and y0 + BLOCK_SIDE <= height:
         pixel = y0 * width + x0
         simd.store_block3(image, 3 * pixel, 3 * width, color)
         simd.store_block1(transmittance, pixel, width, (t,))
-        simd.store_block1(depth, pixel, width, (simd.load(state, Z_SUM + o),))
+        simd.store_block1(depth, pixel, width, (load(state, Z_SUM + o),))
         return
     store_color(state, o, color)
     for lane in range(16):
@@ -206,10 +206,10 @@ def write_block(block, corner, size, background, state, planes):
         if x < width and y < height:
             pixel = y * width + x
             s = o + lane
-            simd.put(transmittance, pixel, simd.get(state, T_LEFT + s))
-            simd.put(depth, pixel, simd.get(state, Z_SUM + s))
+            put(transmittance, pixel, get(state, T_LEFT + s))
+            put(depth, pixel, get(state, Z_SUM + s))
             for channel in range(3):
-                simd.put(image, 3 * pixel + channel, simd.get(state, R_SUM + 256 * channel + s))
+                put(image, 3 * pixel + channel, get(state, R_SUM + 256 * channel + s))
 
 
 @inline
@@ -239,35 +239,35 @@ def blend(
         x, y = pixels_of(grid, block)
         inside = (x < columns) & (y < rows)
         full = simd.where(inside, 1, 0)
-        simd.store(state, T + 16 * block, full)
-        simd.store(state, T_LEFT + 16 * block, full)
+        store(state, T + 16 * block, full)
+        store(state, T_LEFT + 16 * block, full)
         for plane in range(2, 6):
-            simd.store(state, 256 * plane + 16 * block, 0)
+            store(state, 256 * plane + 16 * block, 0)
         if simd.mask_bits(inside) != 0:
             alive |= 1 << block
     batch = state[6 * 256 :]
     # A record without effect, which fills up the last group of four.
-    simd.store(batch, BATCH * rec.RECORD, 0)
-    simd.put(batch, BATCH * rec.RECORD + rec.LOG2_OPACITY, F(-100))
+    store(batch, BATCH * rec.RECORD, 0)
+    put(batch, BATCH * rec.RECORD + rec.LOG2_OPACITY, F(-100))
     for i in range(begin, min(end, begin + AHEAD)):
-        simd.prefetch(records, rec.record_of(entries, i))
+        prefetch(records, rec.record_of(entries, i))
     i = begin
     while i < end and alive != 0:
         count = min(BATCH, end - i)
         reached = 0
         for j in range(count):
             if i + j + AHEAD < end:
-                simd.prefetch(records, rec.record_of(entries, i + j + AHEAD))
+                prefetch(records, rec.record_of(entries, i + j + AHEAD))
             r = rec.record_of(entries, i + j)
             o = rec.RECORD * j
-            simd.store(batch, o, simd.load(records, r))
+            store(batch, o, load(records, r))
             center_x, center_y, (_, _, _, u0, v0) = in_tile(records, r, corner)
             mask = alive
             if cull_blocks:
                 mask &= reachable_blocks(batch, o, center_x, center_y, grid)
-            simd.put(batch, o + rec.X, u0)
-            simd.put(batch, o + rec.Y, v0)
-            simd.put(touched, i + j, mask)
+            put(batch, o + rec.X, u0)
+            put(batch, o + rec.Y, v0)
+            put(touched, i + j, mask)
             reached |= mask
         while reached != 0:
             block = simd.lowest_bit(reached)
@@ -294,28 +294,28 @@ def start_block(block, corner, size, planes, gradients, pixel_weights, wanted, g
     s = BLOCK_STATE * block
     x0, y0 = block_corner(block, corner)
     x, y = pixels_of(grid, block)
-    simd.store(state, s + BACK_X, x)
-    simd.store(state, s + BACK_Y, y)
+    store(state, s + BACK_X, x)
+    store(state, s + BACK_Y, y)
     if x0 + BLOCK_SIDE <= width and y0 + BLOCK_SIDE <= height:
         pixel = y0 * width + x0
         g = simd.load_block3(g_image, 3 * pixel, 3 * width)
         rest = dot3(g, simd.load_block3(image, 3 * pixel, 3 * width))
         if with_alpha:
             kept = simd.load_block1(transmittance, pixel, width)[0]
-            rest = simd.fnma(simd.load_block1(g_alpha, pixel, width)[0], kept, rest)
+            rest = fnma(simd.load_block1(g_alpha, pixel, width)[0], kept, rest)
         if with_depth:
             far = simd.load_block1(g_depth, pixel, width)[0]
-            simd.store(state, s + BACK_DEPTH, far)
-            rest = simd.fma(far, simd.load_block1(depth, pixel, width)[0], rest)
+            store(state, s + BACK_DEPTH, far)
+            rest = fma(far, simd.load_block1(depth, pixel, width)[0], rest)
         if with_absgrad:
-            simd.store(state, s + BACK_WEIGHT, simd.load_block1(pixel_weights, pixel, width)[0])
-        simd.store(state, s + BACK_T, 1)
-        simd.store(state, s + BACK_REST, rest)
+            store(state, s + BACK_WEIGHT, simd.load_block1(pixel_weights, pixel, width)[0])
+        store(state, s + BACK_T, 1)
+        store(state, s + BACK_REST, rest)
         for channel in range(3):
-            simd.store(state, s + BACK_RED + 16 * channel, g[channel])
+            store(state, s + BACK_RED + 16 * channel, g[channel])
         return
     for part in range(0, BACK_X, 16):
-        simd.store(state, s + part, 0)
+        store(state, s + part, 0)
     for lane in range(16):
         column, row = x0 + (lane & 3), y0 + (lane >> 2)
         if column < width and row < height:
@@ -323,29 +323,29 @@ def start_block(block, corner, size, planes, gradients, pixel_weights, wanted, g
             o = s + lane
             rest = F(0)
             if with_alpha:
-                rest -= simd.get(g_alpha, pixel) * simd.get(transmittance, pixel)
+                rest -= get(g_alpha, pixel) * get(transmittance, pixel)
             for channel in range(3):
-                gradient = simd.get(g_image, 3 * pixel + channel)
-                simd.put(state, o + BACK_RED + 16 * channel, gradient)
-                rest += gradient * simd.get(image, 3 * pixel + channel)
+                gradient = get(g_image, 3 * pixel + channel)
+                put(state, o + BACK_RED + 16 * channel, gradient)
+                rest += gradient * get(image, 3 * pixel + channel)
             if with_depth:
-                simd.put(state, o + BACK_DEPTH, simd.get(g_depth, pixel))
-                rest += simd.get(g_depth, pixel) * simd.get(depth, pixel)
+                put(state, o + BACK_DEPTH, get(g_depth, pixel))
+                rest += get(g_depth, pixel) * get(depth, pixel)
             if with_absgrad:
-                simd.put(state, o + BACK_WEIGHT, simd.get(pixel_weights, pixel))
-            simd.put(state, o + BACK_REST, rest)
-            simd.put(state, o + BACK_T, F(1))
+                put(state, o + BACK_WEIGHT, get(pixel_weights, pixel))
+            put(state, o + BACK_REST, rest)
+            put(state, o + BACK_T, F(1))
 
 
 @inline
 def slot_of(integers, row, group):
     """The slot in which a group sums the gradients of a splat."""
     o = rec.RECORD * row
-    origin, extent = simd.integer(integers, o + rec.ORIGIN), simd.integer(integers, o + rec.EXTENT)
+    origin, extent = integer(integers, o + rec.ORIGIN), integer(integers, o + rec.EXTENT)
     x0, y0 = origin & 0xFFFF, origin >> 16
     first_x, first_y = x0 >> rec.GROUP_SHIFT, y0 >> rec.GROUP_SHIFT
     columns = ((x0 + (extent & 0xFFFF) - 1) >> rec.GROUP_SHIFT) - first_x + 1
-    return simd.integer(integers, o + rec.SLOT) + (group[1] - first_y) * columns + group[0] - first_x
+    return integer(integers, o + rec.SLOT) + (group[1] - first_y) * columns + group[0] - first_x
 
 
 @inline
@@ -355,8 +355,8 @@ def splat_backward(records, row, blocks, corner, wanted, state):
     zero = simd.broadcast(0)
     r = rec.RECORD * row
     _, _, (a, b, c, u0, v0) = in_tile(records, r, corner)
-    peak = simd.get(records, r + rec.LOG2_OPACITY)
-    z = simd.get(records, r + rec.DEPTH)
+    peak = get(records, r + rec.LOG2_OPACITY)
+    z = get(records, r + rec.DEPTH)
     color = rec.get3(records, r + rec.RED)
     s_color = s_squares = zero, zero, zero
     s_h, s_u, s_v, s_z = zero, zero, zero, zero
@@ -364,29 +364,29 @@ def splat_backward(records, row, blocks, corner, wanted, state):
     while blocks != 0:
         s = BLOCK_STATE * simd.lowest_bit(blocks)
         blocks &= blocks - 1
-        power, u, v = exponent(a, b, c, u0, v0, peak, simd.load(state, s + BACK_X), simd.load(state, s + BACK_Y))
-        g = simd.load(state, s + BACK_RED), simd.load(state, s + BACK_GREEN), simd.load(state, s + BACK_BLUE)
+        power, u, v = exponent(a, b, c, u0, v0, peak, load(state, s + BACK_X), load(state, s + BACK_Y))
+        g = load(state, s + BACK_RED), load(state, s + BACK_GREEN), load(state, s + BACK_BLUE)
         d = dot3(g, color)
         if with_depth:
-            d = simd.fma(simd.load(state, s + BACK_DEPTH), z, d)
-        t = simd.load(state, s + BACK_T)
-        rest = simd.load(state, s + BACK_REST)
+            d = fma(load(state, s + BACK_DEPTH), z, d)
+        t = load(state, s + BACK_T)
+        rest = load(state, s + BACK_REST)
         raw, alpha, after, open_, weight = formulas.blend_step(power, t)
-        simd.store(state, s + BACK_REST, simd.fnma(weight, d, rest))
-        simd.store(state, s + BACK_T, simd.maximum(after, TINY))
+        store(state, s + BACK_REST, fnma(weight, d, rest))
+        store(state, s + BACK_T, simd.maximum(after, TINY))
         h = simd.where(open_ & (raw <= formulas.ALPHA_MAX), alpha / (1 - alpha) * (t * d - rest), 0)
         s_color = fma3(weight, g, s_color)
         hu, hv = h * u, h * v
         s_h, s_u, s_v = s_h + h, s_u + hu, s_v + hv
         s_uu, s_uv, s_vv = s_squares
-        s_squares = simd.fma(hu, u, s_uu), simd.fma(hu, v, s_uv), simd.fma(hv, v, s_vv)
+        s_squares = fma(hu, u, s_uu), fma(hu, v, s_uv), fma(hv, v, s_vv)
         if with_depth:
-            s_z = simd.fma(weight, simd.load(state, s + BACK_DEPTH), s_z)
+            s_z = fma(weight, load(state, s + BACK_DEPTH), s_z)
         if with_absgrad:
-            along_y = simd.fma(b, hu, c * hv)
+            along_y = fma(b, hu, c * hv)
             s_ax = s_ax + simd.abs(hu)
             s_ay = s_ay + simd.abs(along_y)
-            s_map = simd.fma(weight, simd.load(state, s + BACK_WEIGHT), s_map)
+            s_map = fma(weight, load(state, s + BACK_WEIGHT), s_map)
     return simd.lane_sums((*s_color, s_h, s_u, s_v, *s_squares, s_z, s_ax, s_ay, s_map))
 
 
@@ -399,17 +399,15 @@ def tile_backward(records, integers, entries, begin, end, corner, group, wanted,
     """Add up the gradients of all splats of a tile, front to back."""
     for i in range(begin, end):
         if i + AHEAD < end:
-            simd.prefetch(records, rec.record_of(entries, i + AHEAD))
+            prefetch(records, rec.record_of(entries, i + AHEAD))
         if i + SLOT_AHEAD < end:
-            coming = simd.integer(entries, i + SLOT_AHEAD)
-            simd.prefetch(sums, rec.RECORD * slot_of(integers, coming, group))
-        blocks = simd.integer(touched, i)
+            prefetch(sums, rec.RECORD * slot_of(integers, integer(entries, i + SLOT_AHEAD), group))
+        blocks = integer(touched, i)
         if blocks == 0:
             continue
-        row = simd.integer(entries, i)
+        row = integer(entries, i)
         slot = rec.RECORD * slot_of(integers, row, group)
-        here = splat_backward(records, row, blocks, corner, wanted, state)
-        simd.store(sums, slot, simd.load(sums, slot) + here)
+        store(sums, slot, load(sums, slot) + splat_backward(records, row, blocks, corner, wanted, state))
 
 
 @parallel
@@ -446,29 +444,29 @@ def total_slots(part, parts, ids, slots, records, integers, sums, g_means2d, wit
     """
     count = ids.shape[0]
     for i in range(*share(count, part, parts)):
-        row = simd.integer(ids, i)
+        row = integer(ids, i)
         clear_between(ids, i, 2, g_means2d)
         if with_absgrad:
             clear_between(ids, i, 3, absgrad)
         r = rec.RECORD * row
-        slot = simd.integer(integers, r + rec.SLOT)
+        slot = integer(integers, r + rec.SLOT)
         end = np.int64(slots)
         if i + 1 < count:
-            end = simd.integer(integers, rec.record_of(ids, i + 1) + rec.SLOT)
+            end = integer(integers, rec.record_of(ids, i + 1) + rec.SLOT)
         o = rec.RECORD * slot
         if end > slot + 1:
-            total = simd.load(sums, o)
+            total = load(sums, o)
             for other in range(slot + 1, end):
-                total = total + simd.load(sums, rec.RECORD * other)
-            simd.store(sums, o, total)
-        u, v = simd.get(sums, o + rec.SUM_U), simd.get(sums, o + rec.SUM_V)
+                total = total + load(sums, rec.RECORD * other)
+            store(sums, o, total)
+        u, v = get(sums, o + rec.SUM_U), get(sums, o + rec.SUM_V)
         a, b, c = rec.get3(records, r + rec.A)
-        simd.put(g_means2d, 2 * row, TWO_LN2 * a * u)
-        simd.put(g_means2d, 2 * row + 1, TWO_LN2 * (b * u + c * v))
+        put(g_means2d, 2 * row, TWO_LN2 * a * u)
+        put(g_means2d, 2 * row + 1, TWO_LN2 * (b * u + c * v))
         if with_absgrad:
-            simd.put(absgrad, 3 * row, abs(TWO_LN2 * a) * simd.get(sums, o + rec.ABS_X))
-            simd.put(absgrad, 3 * row + 1, TWO_LN2 * simd.get(sums, o + rec.ABS_Y))
-            simd.put(absgrad, 3 * row + 2, simd.get(sums, o + rec.SUM_WEIGHT))
+            put(absgrad, 3 * row, abs(TWO_LN2 * a) * get(sums, o + rec.ABS_X))
+            put(absgrad, 3 * row + 1, TWO_LN2 * get(sums, o + rec.ABS_Y))
+            put(absgrad, 3 * row + 2, get(sums, o + rec.SUM_WEIGHT))
     if part == parts - 1:
         clear_between(ids, count, 2, g_means2d)
         clear_between(ids, count, 3, absgrad)

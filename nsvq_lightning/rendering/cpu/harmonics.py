@@ -3,6 +3,7 @@
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import inline, parallel
 from nsvq_lightning.compute.rows import clear, vector_share
+from nsvq_lightning.compute.simd import fma, get, integer, load, prefetch, put, store
 from nsvq_lightning.rendering import formulas
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.formulas import C0, bands1, bands2, bands3, unit_direction
@@ -21,9 +22,9 @@ def prefetch_sh(array, ids, start, end, stride, used):
     """Prefetch the SH rows of 16 later splats of the list, ``used`` floats of each."""
     if start < end:
         for lane in range(16):
-            row = simd.integer(ids, start + lane) * stride
+            row = integer(ids, start + lane) * stride
             for k in range(0, used, 16):
-                simd.prefetch(array, row + k)
+                prefetch(array, row + k)
 
 
 @inline
@@ -40,12 +41,12 @@ def gather_sh(shN, ids, start, stride, count, columns):
             first = min(16 * block, SH_ROW - 16)
             rows = simd.gather_columns(shN, ids, start, stride, first)
             for k in range(16):
-                simd.store(columns, 16 * (first + k), rows[k])
+                store(columns, 16 * (first + k), rows[k])
     else:
         for lane in range(16):
-            row = simd.integer(ids, start + lane) * stride
+            row = integer(ids, start + lane) * stride
             for k in range(count):
-                simd.put(columns, 16 * k + lane, simd.get(shN, row + k))
+                put(columns, 16 * k + lane, get(shN, row + k))
 
 
 @inline
@@ -53,7 +54,7 @@ def add_bands(columns, first, basis, rgb):
     """Add coefficients from the ``first`` on, counted without the constant one, times basis values to a colour."""
     for i in range(len(basis)):
         o = 48 * (first + i)
-        coefficient = simd.load(columns, o), simd.load(columns, o + 16), simd.load(columns, o + 32)
+        coefficient = load(columns, o), load(columns, o + 16), load(columns, o + 32)
         rgb = formulas.fma3(basis[i], coefficient, rgb)
     return rgb
 
@@ -61,7 +62,7 @@ def add_bands(columns, first, basis, rgb):
 @inline
 def color(degree, d, sh0, columns):
     """0.5 + Σ coefficient·basis for 16 splats, before the clamp at 0."""
-    rgb = simd.fma(sh0[0], C0, 0.5), simd.fma(sh0[1], C0, 0.5), simd.fma(sh0[2], C0, 0.5)
+    rgb = fma(sh0[0], C0, 0.5), fma(sh0[1], C0, 0.5), fma(sh0[2], C0, 0.5)
     if degree > 0:
         rgb = add_bands(columns, 0, bands1(d), rgb)
     if degree > 1:
@@ -89,11 +90,11 @@ def add_colors(part, parts, camera, means, colors, bands, ids, count, records):
             gather_sh(shN, ids, start, stride, coefficients, scratch)
         rgb = formulas.clamped(color(degree, direction, simd.gather_rows3(sh0, ids, start), scratch))
         for channel in range(3):
-            simd.store(scratch, 16 * channel, rgb[channel])
+            store(scratch, 16 * channel, rgb[channel])
         for lane in range(min(16, last - start)):
             o = rec.record_of(ids, start + lane) + rec.RED
             for channel in range(3):
-                simd.put(records, o + channel, simd.get(scratch, 16 * channel + lane))
+                put(records, o + channel, get(scratch, 16 * channel + lane))
 
 
 @inline
@@ -112,11 +113,11 @@ def put_bands(gradient, e, columns, first, basis, rgb):
     """Write the gradient columns of coefficients from the ``first`` on, and their shares of the direction gradient."""
     for i in range(len(basis)):
         o = 48 * (first + i)
-        total = simd.load(columns, o) * rgb[0]
-        total = simd.fma(simd.load(columns, o + 16), rgb[1], total)
-        simd.store(e, 16 * (first + i), simd.fma(simd.load(columns, o + 32), rgb[2], total))
+        total = load(columns, o) * rgb[0]
+        total = fma(load(columns, o + 16), rgb[1], total)
+        store(e, 16 * (first + i), fma(load(columns, o + 32), rgb[2], total))
         for channel in range(3):
-            simd.store(gradient, o + 16 * channel, basis[i] * rgb[channel])
+            store(gradient, o + 16 * channel, basis[i] * rgb[channel])
 
 
 @inline
@@ -126,12 +127,12 @@ def scatter_sh(gradient, columns, ids, start, stride, count):
         for first in (0, 16, SH_ROW - 16):
             rows = simd.transpose(simd.load_vectors(columns, 16 * first))
             for lane in range(16):
-                simd.store(gradient, simd.integer(ids, start + lane) * stride + first, rows[lane])
+                store(gradient, integer(ids, start + lane) * stride + first, rows[lane])
     else:
         for lane in range(16):
-            row = simd.integer(ids, start + lane) * stride
+            row = integer(ids, start + lane) * stride
             for k in range(count):
-                simd.put(gradient, row + k, simd.get(columns, 16 * k + lane))
+                put(gradient, row + k, get(columns, 16 * k + lane))
             clear(gradient, row + count, row + stride)
 
 

@@ -5,6 +5,7 @@ import numpy as np
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, parallel
 from nsvq_lightning.compute.rows import clear, load_numbers, load_quats, load_vectors, vector_share
+from nsvq_lightning.compute.simd import get, integer, load, put, store
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.formulas import footprint, view_point
 
@@ -32,16 +33,15 @@ def project_splats(
         lanes = (1 << count) - 1
         view = rec.load_view(camera)
         point = view_point(view, mean)
-        if simd.mask_bits(point[2] > simd.get(camera, rec.NEAR)) & lanes == 0:
+        if simd.mask_bits(point[2] > get(camera, rec.NEAR)) & lanes == 0:
             continue
         quat, scale = load_quats(quats, start, count), load_vectors(scales, start, count)
         logit = load_numbers(logits, start, count)
         trained_at = None
         if sampling is not None:
-            nearest = load_numbers(sampling[0], start, count)
-            farthest = load_numbers(sampling[1], start, count)
+            nearest, farthest = load_numbers(sampling[0], start, count), load_numbers(sampling[1], start, count)
             trained_at = nearest, farthest, sampling[2]
-        screen = simd.get(camera, rec.CX), simd.get(camera, rec.CY), *rec.get3(camera, rec.WIDTH)
+        screen = get(camera, rec.CX), get(camera, rec.CY), *rec.get3(camera, rec.WIDTH)
         seen, record, corner, end, radius = footprint(view, screen, point, quat, scale, logit, trained_at)
         bits = simd.mask_bits(seen) & lanes
         if bits == 0:
@@ -49,26 +49,26 @@ def project_splats(
         color = later = zero, zero, zero
         rows = simd.transpose((*record[: rec.RED], *color, *record[rec.RED :], zero, *later))
         for lane in range(16):
-            simd.store(scratch, 128 + 16 * lane, rows[lane])
+            store(scratch, 128 + 16 * lane, rows[lane])
         for k in range(2):
-            simd.store(scratch, 16 * k, corner[k])
-            simd.store(scratch, 32 + 16 * k, end[k])
-        simd.store(scratch, 64, radius)
+            store(scratch, 16 * k, corner[k])
+            store(scratch, 32 + 16 * k, end[k])
+        store(scratch, 64, radius)
         while bits != 0:
             lane = simd.lowest_bit(bits)
             bits &= bits - 1
             row = start + lane
             o = rec.RECORD * row
-            simd.store(records, o, simd.load(scratch, 128 + 16 * lane))
-            x0, y0 = simd.integer(scratch, lane), simd.integer(scratch, 16 + lane)
-            x1, y1 = simd.integer(scratch, 32 + lane), simd.integer(scratch, 48 + lane)
-            simd.put(integers, o + rec.SLOT, needed)
-            simd.put(integers, o + rec.ORIGIN, x0 | (y0 << 16))
-            simd.put(integers, o + rec.EXTENT, (x1 - x0 + 1) | ((y1 - y0 + 1) << 16))
-            simd.put(integers, o + rec.RADIUS, np.int64(min(simd.get(scratch, 64 + lane), F(1e9))))
+            store(records, o, load(scratch, 128 + 16 * lane))
+            x0, y0 = integer(scratch, lane), integer(scratch, 16 + lane)
+            x1, y1 = integer(scratch, 32 + lane), integer(scratch, 48 + lane)
+            put(integers, o + rec.SLOT, needed)
+            put(integers, o + rec.ORIGIN, x0 | (y0 << 16))
+            put(integers, o + rec.EXTENT, (x1 - x0 + 1) | ((y1 - y0 + 1) << 16))
+            put(integers, o + rec.RADIUS, np.int64(min(get(scratch, 64 + lane), F(1e9))))
             columns = (x1 >> rec.GROUP_SHIFT) - (x0 >> rec.GROUP_SHIFT) + 1
             needed += columns * ((y1 >> rec.GROUP_SHIFT) - (y0 >> rec.GROUP_SHIFT) + 1)
-            simd.put(found, first + visible, row)
+            put(found, first + visible, row)
             visible += 1
     counts[part], slots[part] = visible, needed
 
@@ -90,23 +90,23 @@ def join_runs(part, parts, runs, records, integers, listed, means2d, radii):
     unseen = first
     start, slot = counts[:part].sum(), slots[:part].sum()
     for k in range(counts[part]):
-        row = simd.integer(found, first + k)
+        row = integer(found, first + k)
         clear(means2d, 2 * unseen, 2 * row)
         clear(radii, unseen, row)
         unseen = row + 1
         o = rec.RECORD * row
-        simd.put(ids, start + k, row)
-        simd.put(integers, o + rec.SLOT, simd.integer(integers, o + rec.SLOT) + slot)
+        put(ids, start + k, row)
+        put(integers, o + rec.SLOT, integer(integers, o + rec.SLOT) + slot)
         # Depths are positive, so their bits sort as integers.
-        simd.put(keys, start + k, simd.get(integers, o + rec.DEPTH))
-        simd.put(order, start + k, start + k)
-        extent = simd.integer(integers, o + rec.EXTENT)
-        simd.put(boxes, start + k, simd.integer(integers, o + rec.ORIGIN) | (extent << 32))
-        simd.put(means2d, 2 * row, simd.get(records, o + rec.X))
-        simd.put(means2d, 2 * row + 1, simd.get(records, o + rec.Y))
-        simd.put(radii, row, simd.get(integers, o + rec.RADIUS))
+        put(keys, start + k, get(integers, o + rec.DEPTH))
+        put(order, start + k, start + k)
+        extent = integer(integers, o + rec.EXTENT)
+        put(boxes, start + k, integer(integers, o + rec.ORIGIN) | (extent << 32))
+        put(means2d, 2 * row, get(records, o + rec.X))
+        put(means2d, 2 * row + 1, get(records, o + rec.Y))
+        put(radii, row, get(integers, o + rec.RADIUS))
     clear(means2d, 2 * unseen, 2 * last)
     clear(radii, unseen, last)
     if start + counts[part] == total and counts[part] > 0:
         for k in range(16):
-            simd.put(ids, total + k, simd.get(ids, total - 1))
+            put(ids, total + k, get(ids, total - 1))

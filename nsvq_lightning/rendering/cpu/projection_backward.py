@@ -5,6 +5,7 @@ import numpy as np
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import inline, parallel
 from nsvq_lightning.compute.rows import clear, vector_share
+from nsvq_lightning.compute.simd import get, integer, load, prefetch, put
 from nsvq_lightning.rendering import formulas
 from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.cpu.harmonics import AHEAD, coefficients_of, color_backward, prefetch_sh
@@ -34,9 +35,9 @@ def project_backward(
     work, slot = simd.scratch(32), simd.scratch(16).view(np.int32)
     # Between its first and last visible splat, every part clears the rows that it skips.
     begin, end = vector_share(count, part, parts)
-    row = simd.integer(ids, begin - 1) + 1 if begin > 0 else 0
+    row = integer(ids, begin - 1) + 1 if begin > 0 else 0
     for i in range(begin, end):
-        here = simd.integer(ids, i)
+        here = integer(ids, i)
         if here > row:
             clear_rows(row, here, stride, gradients)
         row = here + 1
@@ -47,14 +48,13 @@ def project_backward(
         prefetch_sh(g_shN, ids, start + AHEAD, end, stride, stride)
         if start + AHEAD < end:
             for lane in range(16):
-                coming = rec.record_of(ids, start + AHEAD + lane)
-                simd.prefetch(sums, rec.record_of(integers, coming + rec.SLOT))
+                prefetch(sums, rec.record_of(integers, rec.record_of(ids, start + AHEAD + lane) + rec.SLOT))
         for lane in range(16):
-            row = simd.integer(ids, start + lane)
-            simd.put(slot, lane, simd.get(integers, rec.RECORD * row + rec.SLOT))
-            simd.put(work, lane, simd.get(g_means2d, 2 * row))
-            simd.put(work, 16 + lane, simd.get(g_means2d, 2 * row + 1))
-        g2x, g2y = simd.load(work, 0), simd.load(work, 16)
+            row = integer(ids, start + lane)
+            put(slot, lane, get(integers, rec.RECORD * row + rec.SLOT))
+            put(work, lane, get(g_means2d, 2 * row))
+            put(work, 16 + lane, get(g_means2d, 2 * row + 1))
+        g2x, g2y = load(work, 0), load(work, 16)
         total = simd.gather_columns(sums, slot, 0, rec.RECORD, 0)
         record = simd.gather_columns(records, ids, start, rec.RECORD, 0)
         mean = simd.gather_rows3(means, ids, start)
@@ -70,8 +70,7 @@ def project_backward(
             view, formulas.view_point(view, mean), quat, scale, factor, moments, total[rec.SUM_H], (g2x, g2y),
             total[rec.SUM_DEPTH], trained_at,
         )  # fmt: skip
-        colors = record[rec.RED : rec.DEPTH]
-        rgb = formulas.unclamped(colors, total[rec.SUM_RED : rec.SUM_H])
+        rgb = formulas.unclamped(record[rec.RED : rec.DEPTH], total[rec.SUM_RED : rec.SUM_H])
         through_color = color_backward(camera, bands, mean, shN, ids, start, rgb, g_sh0, g_shN)
         simd.scatter_rows3(g_means, ids, start, formulas.add3(g_mean, through_color))
         simd.scatter_rows4(g_quats, ids, start, g_quat)

@@ -12,9 +12,9 @@ fixed order, whichever thread processed which group: results have the same bits 
 
 import numpy as np
 
-from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import inline
 from nsvq_lightning.compute.memory import Array
+from nsvq_lightning.compute.simd import get, integer
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.formulas import TILE
 
@@ -61,20 +61,20 @@ GROUP_TILES = 1 << 2 * GROUP_SHIFT
 @inline
 def get3(array, offset):
     """Three consecutive numbers."""
-    return simd.get(array, offset), simd.get(array, offset + 1), simd.get(array, offset + 2)
+    return get(array, offset), get(array, offset + 1), get(array, offset + 2)
 
 
 @inline
 def record_of(rows, i):
     """Where the record of the i-th of some rows begins."""
-    return RECORD * simd.integer(rows, i)
+    return RECORD * integer(rows, i)
 
 
 @inline
 def load_view(camera):
     """The view of :mod:`nsvq_lightning.rendering.formulas`."""
     rotation = get3(camera, ROTATION), get3(camera, ROTATION + 3), get3(camera, ROTATION + 6)
-    focal = simd.get(camera, FX), simd.get(camera, FY)
-    slopes_x = simd.get(camera, LOW_X), simd.get(camera, HIGH_X)
-    slopes_y = simd.get(camera, LOW_Y), simd.get(camera, HIGH_Y)
+    focal = get(camera, FX), get(camera, FY)
+    slopes_x = get(camera, LOW_X), get(camera, HIGH_X)
+    slopes_y = get(camera, LOW_Y), get(camera, HIGH_Y)
     return rotation, get3(camera, TRANSLATION), focal, slopes_x, slopes_y
