@@ -12,6 +12,7 @@ import torch
 import triton
 import triton.language as tl
 from torch import Tensor
+from triton.language import constexpr
 
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.formulas import for_triton
@@ -22,8 +23,8 @@ from nsvq_lightning.quality.formulas import DERIVATIVES, MOMENTS, SSIM_RADIUS, c
 formulas = for_triton(shared)
 
 # The taps of the window, from the middle outwards.
-TAPS, RADIUS = tl.constexpr(tuple(ssim_window()[SSIM_RADIUS:].tolist())), tl.constexpr(SSIM_RADIUS)
-LOG_WEIGHT, LEAST_ERROR = tl.constexpr(shared.LOG_WEIGHT), tl.constexpr(shared.LEAST_ERROR)
+TAPS, RADIUS = constexpr(tuple(ssim_window()[SSIM_RADIUS:].tolist())), constexpr(SSIM_RADIUS)
+LOG_WEIGHT, LEAST_ERROR = constexpr(shared.LOG_WEIGHT), constexpr(shared.LEAST_ERROR)
 # Image rows per program: four floats per thread, so that registers suffice for all taps.
 ROWS = 4
 # Floats of each row per program, three to a pixel.
@@ -35,7 +36,7 @@ BLOCK = 1024
 
 
 @triton.jit
-def place(height, length, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+def place(height, length, ROWS: constexpr, COLUMNS: constexpr):
     """Where this program works: rows ``[ROWS, 1]``, columns ``[1, COLUMNS]``; height and length of a plane."""
     row = tl.program_id(0) * ROWS + tl.arange(0, ROWS)[:, None]
     column = tl.program_id(1) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
@@ -78,11 +79,11 @@ def store_at(plane, at, values):
     tl.store(place, values, mask=inside)
 
 
-WHITE = tl.constexpr(255.0)
+WHITE = constexpr(255.0)
 
 
 @triton.jit
-def pixels(image, target, at, down, BYTES: tl.constexpr):
+def pixels(image, target, at, down, BYTES: constexpr):
     """The image clamped to [0, 1], and the target in [0, 1], so many rows down."""
     p = formulas.clamped(load_at(image, at, down, 0))
     q = load_at(target, at, down, 0).to(tl.float32)
@@ -93,8 +94,7 @@ def pixels(image, target, at, down, BYTES: tl.constexpr):
 
 @triton.jit
 def moments_kernel(
-    image, target, moments, sums, height, length, PSNR: tl.constexpr, BYTES: tl.constexpr, ROWS: tl.constexpr,
-    COLUMNS: tl.constexpr,
+    image, target, moments, sums, height, length, PSNR: constexpr, BYTES: constexpr, ROWS: constexpr, COLUMNS: constexpr
 ):  # fmt: skip
     """Vertical blur of the four moment planes; sum of absolute or squared differences into ``sums[2·program]``."""
     at = place(height, length, ROWS, COLUMNS)
@@ -128,7 +128,7 @@ def blur_along(plane, at):
 
 @triton.jit
 def similarity_kernel(
-    moments, derivatives, sums, height, length, DERIVED: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr
+    moments, derivatives, sums, height, length, DERIVED: constexpr, ROWS: constexpr, COLUMNS: constexpr
 ):  # fmt: skip
     """Sum of SSIM into ``sums[2·program + 1]``; if ``DERIVED``, also its derivatives by blurred p, p² and p·q."""
     at = place(height, length, ROWS, COLUMNS)
@@ -146,7 +146,7 @@ def similarity_kernel(
 
 
 @triton.jit
-def loss_kernel(sums, loss, programs, count, dssim_weight, PSNR: tl.constexpr, BLOCK: tl.constexpr):
+def loss_kernel(sums, loss, programs, count, dssim_weight, PSNR: constexpr, BLOCK: constexpr):
     """Add up the sums of all programs, in float64; the loss is followed by the steps of its gradient.
 
     It is (1 - w)·Σ|p - q|/n + w·(1 - ΣSSIM/n), the first sum replaced by 0.016·ln(Σ(p - q)²/n + 1e-5) for PSNR.
@@ -171,7 +171,7 @@ def loss_kernel(sums, loss, programs, count, dssim_weight, PSNR: tl.constexpr, B
 
 
 @triton.jit
-def spread_kernel(derivatives, blurred, height, length, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+def spread_kernel(derivatives, blurred, height, length, ROWS: constexpr, COLUMNS: constexpr):
     """Vertical blur of one derivative plane, the one selected by the third axis of the grid."""
     at = place(height, length, ROWS, COLUMNS)
     plane = tl.program_id(2)
@@ -181,8 +181,8 @@ def spread_kernel(derivatives, blurred, height, length, ROWS: tl.constexpr, COLU
 
 @triton.jit
 def gradient_kernel(
-    image, target, blurred, steps, scale, gradient, height, length, BYTES: tl.constexpr, ROWS: tl.constexpr,
-    COLUMNS: tl.constexpr,
+    image, target, blurred, steps, scale, gradient, height, length,
+    BYTES: constexpr, ROWS: constexpr, COLUMNS: constexpr,
 ):  # fmt: skip
     """Gradient of ``scale`` times the loss, 0 where the image was clamped."""
     at = place(height, length, ROWS, COLUMNS)

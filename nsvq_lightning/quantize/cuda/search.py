@@ -17,24 +17,25 @@ import torch
 import triton
 import triton.language as tl
 from torch import Tensor
+from triton.language import constexpr
 
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
 from nsvq_lightning.quantize.box_search import ROUNDING
 from nsvq_lightning.quantize.scores import LIST
 
-ROWS = tl.constexpr(8)  # rows per program of a search
-CODES = tl.constexpr(128)  # codes that it compares its rows with at a time
-BLOCK = tl.constexpr(64)  # rows, or codes, per program of a check
-COPIED = tl.constexpr(1024)  # numbers per program of a copy
-MEMBERS = tl.constexpr(LIST)  # codes in the list of a row
-SLACK = tl.constexpr(ROUNDING)
+ROWS = constexpr(8)  # rows per program of a search
+CODES = constexpr(128)  # codes that it compares its rows with at a time
+BLOCK = constexpr(64)  # rows, or codes, per program of a check
+COPIED = constexpr(1024)  # numbers per program of a copy
+MEMBERS = constexpr(LIST)  # codes in the list of a row
+SLACK = constexpr(ROUNDING)
 # A kernel that is compiled once for all numbers of rows.
 kernel_of_any_count = triton.jit(do_not_specialize=["count"])
 
 
 @triton.jit
-def places(SIZE: tl.constexpr):
+def places(SIZE: constexpr):
     """The numbers ``[SIZE]`` of what this program works on, where each program has as many."""
     return tl.program_id(0).to(tl.int64) * SIZE + tl.arange(0, SIZE)
 
@@ -46,7 +47,7 @@ def load_if(pointer, mask):
 
 
 @triton.jit
-def compare(x, at, codebook, num_codes, code_stride, DIM: tl.constexpr, WITH_SECOND: tl.constexpr):
+def compare(x, at, codebook, num_codes, code_stride, DIM: constexpr, WITH_SECOND: constexpr):
     """Compare rows with all codes ``[DIM, code_stride]``, which are infinite beyond ``num_codes``.
 
     Each column stands for every ``CODES``-th code. Returns their smallest distance to each row ``[ROWS, CODES]``, the
@@ -81,7 +82,7 @@ def least_of(smallest, chosen, num_codes):
 
 
 @kernel_of_any_count
-def nearest_kernel(x, codebook, result, count, num_codes, code_stride, DIM: tl.constexpr):
+def nearest_kernel(x, codebook, result, count, num_codes, code_stride, DIM: constexpr):
     """Nearest code of each row ``[count, DIM]``."""
     row = places(ROWS)
     at = tl.minimum(row, tl.cast(count, tl.int64) - 1) * DIM
@@ -138,7 +139,7 @@ def empty_memory(count: int, dim: int, device: torch.device) -> tuple[Tensor, ..
     return codes, lists, torch.zeros(count, dim, device=device), clearance, limits
 
 
-LARGEST = tl.constexpr(float(torch.finfo(torch.float32).max))
+LARGEST = constexpr(float(torch.finfo(torch.float32).max))
 
 
 @triton.jit
@@ -154,7 +155,7 @@ def bound_below(squared):
 
 
 @triton.jit
-def drift_kernel(codebook, snapshot, squared_drift, num_codes, DIM: tl.constexpr):
+def drift_kernel(codebook, snapshot, squared_drift, num_codes, DIM: constexpr):
     """Raise ``squared_drift[0]``, the bits of a float32, to how far any of the codes has moved since the snapshot."""
     code = places(BLOCK)
     inside = code < num_codes
@@ -202,7 +203,7 @@ def queue_kernel(ends, queue, count):
 @kernel_of_any_count
 def check_kernel(
     x, rows, codebook, last, lists, anchors, clearance, limits, travelled, squared_drift, result, searched, count,
-    DIM: tl.constexpr,
+    DIM: constexpr,
 ):  # fmt: skip
     """Codes of the rows for which a bound proves one; 1 in ``searched`` for the others.
 
@@ -256,7 +257,7 @@ def check_kernel(
 @kernel_of_any_count
 def search_kernel(
     x, rows, queue, ends, codebook, last, lists, anchors, clearance, limits, travelled, squared_drift, result, count,
-    num_codes, code_stride, DIM: tl.constexpr,
+    num_codes, code_stride, DIM: constexpr,
 ):  # fmt: skip
     """Search the rows in the queue and remember what was found; ``ends[count - 1]`` is its length."""
     length = tl.load(ends + count - 1)

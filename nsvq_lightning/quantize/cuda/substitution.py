@@ -13,6 +13,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
+from triton.language import constexpr
 
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.memory import check_tensor
@@ -20,15 +21,15 @@ from nsvq_lightning.compute.rows import sorted_by_key
 from nsvq_lightning.quantize import substitution
 from nsvq_lightning.quantize.cuda.search import load_if, places
 
-SPLIT = tl.constexpr(0x3F3504F3)  # bits of 1/√2: a mantissa lies in [1/√2, √2)
-TWO_LOG2_E = tl.constexpr(2 / math.log(2))
-ARTANH = tl.constexpr((1 / 11, 1 / 9, 1 / 7, 1 / 5, 1 / 3, 1.0))
-TINY = tl.constexpr(torch.finfo(torch.float32).tiny)
+SPLIT = constexpr(0x3F3504F3)  # bits of 1/√2: a mantissa lies in [1/√2, √2)
+TWO_LOG2_E = constexpr(2 / math.log(2))
+ARTANH = constexpr((1 / 11, 1 / 9, 1 / 7, 1 / 5, 1 / 3, 1.0))
+TINY = constexpr(torch.finfo(torch.float32).tiny)
 
-ROWS = tl.constexpr(16)  # rows of a code that are added up side by side
+ROWS = constexpr(16)  # rows of a code that are added up side by side
 # Most programs that share the rows of one code, so that one of very many is no long tail; a power of two.
-PARTS = tl.constexpr(8)
-PART = tl.constexpr(256)  # fewest rows of a part, but for the last one
+PARTS = constexpr(8)
+PART = constexpr(256)  # fewest rows of a part, but for the last one
 
 
 @triton.jit
@@ -45,10 +46,10 @@ def log2(x):
     return tl.fma(s * TWO_LOG2_E, series, exponent.to(tl.float32))
 
 
-GOLDEN, FIRST, SECOND = (tl.constexpr(value) for value in substitution.MULTIPLIERS)
-COS, SIN = tl.constexpr(substitution.COS), tl.constexpr(substitution.SIN)
-UNIT = tl.constexpr(2.0**-24)
-MINUS_TWO_LN2 = tl.constexpr(-2 * math.log(2))
+GOLDEN, FIRST, SECOND = (constexpr(value) for value in substitution.MULTIPLIERS)
+COS, SIN = constexpr(substitution.COS), constexpr(substitution.SIN)
+UNIT = constexpr(2.0**-24)
+MINUS_TWO_LN2 = constexpr(-2 * math.log(2))
 
 
 @triton.jit
@@ -78,9 +79,7 @@ def normal(seed, vector, lane):
 
 
 @triton.jit
-def chosen_rows(
-    x, rows, codebook, codes, count, height, num_codes, DIM: tl.constexpr, ROWS: tl.constexpr, WIDTH: tl.constexpr
-):
+def chosen_rows(x, rows, codebook, codes, count, height, num_codes, DIM: constexpr, ROWS: constexpr, WIDTH: constexpr):
     """Place among the chosen rows, columns, row numbers, masks (inside the tile, and valid), rows, and their codes.
 
     A row outside the table, or whose code is outside the codebook, is NaN; raising an error would need a sync.
@@ -104,8 +103,8 @@ def inverses(squared):
 
 @triton.jit(do_not_specialize=["seed", "count", "height"])
 def substitute_kernel(
-    seed, aim, spread, x, rows, codebook, codes, out, count, height, num_codes, DIM: tl.constexpr, ROWS: tl.constexpr,
-    WIDTH: tl.constexpr,
+    seed, aim, spread, x, rows, codebook, codes, out, count, height, num_codes, DIM: constexpr, ROWS: constexpr,
+    WIDTH: constexpr,
 ):  # fmt: skip
     """``x + ‖x − c‖·d/‖d‖`` with ``d = aim·(c − x) + spread·v``, for some rows."""
     i, column, _, inside, _, value, centre = chosen_rows(
@@ -125,8 +124,8 @@ def substitute_kernel(
 
 @triton.jit(do_not_specialize=["count", "height"])
 def radial_kernel(
-    grad, x, rows, codebook, codes, out, grad_x, radials, count, height, num_codes, DIM: tl.constexpr,
-    ROWS: tl.constexpr, WIDTH: tl.constexpr,
+    grad, x, rows, codebook, codes, out, grad_x, radials, count, height, num_codes, DIM: constexpr,
+    ROWS: constexpr, WIDTH: constexpr,
 ):  # fmt: skip
     """Write the gradient of the rows to the table of all rows, and minus its radial term to ``radials``."""
     i, column, row, inside, there, value, centre = chosen_rows(
@@ -202,7 +201,7 @@ def part_size(begin, end):
 
 
 @triton.jit
-def part_kernel(values, order, offsets, partial, dim, WIDTH: tl.constexpr):
+def part_kernel(values, order, offsets, partial, dim, WIDTH: constexpr):
     """Sum a part of a code's rows ``order[offsets[code]:offsets[code + 1]]`` in the dtype of ``partial``."""
     program = tl.program_id(0).to(tl.int64)
     code, part = program // PARTS, (program % PARTS).to(tl.int32)
@@ -222,7 +221,7 @@ def part_kernel(values, order, offsets, partial, dim, WIDTH: tl.constexpr):
 
 
 @triton.jit
-def sum_kernel(partial, offsets, sums, dim, WIDTH: tl.constexpr):
+def sum_kernel(partial, offsets, sums, dim, WIDTH: constexpr):
     """Sum the parts of a code; 0 for a code without rows."""
     code = tl.program_id(0).to(tl.int64)
     column = tl.program_id(1) * WIDTH + tl.arange(0, WIDTH)

@@ -13,6 +13,7 @@ import torch
 import triton
 import triton.language as tl
 from torch import Tensor
+from triton.language import constexpr
 
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.formulas import for_triton
@@ -67,7 +68,7 @@ def blend_step(fetched, left, top, x, y, t):
 @triton.jit
 def blend_kernel(
     records, ranks, offsets, order, ends, background, image, transmittance, depth, columns, width, height,
-    BATCH: tl.constexpr,
+    BATCH: constexpr,
 ):  # fmt: skip
     """Image, transmittance and depth of a tile, and the end of the part of its list that was processed."""
     tile = tl.load(order + tl.program_id(0))
@@ -112,7 +113,7 @@ def store_sums(field, values):
 @triton.jit
 def blend_backward_kernel(
     records, ranks, slots, offsets, order, ends, image, transmittance, depth, g_image, g_alpha, g_depth, pixel_weights,
-    sums, columns, width, height, WITH_ALPHA: tl.constexpr, WITH_DEPTH: tl.constexpr, WITH_ABSGRAD: tl.constexpr,
+    sums, columns, width, height, WITH_ALPHA: constexpr, WITH_DEPTH: constexpr, WITH_ABSGRAD: constexpr,
 ):  # fmt: skip
     """Write the sums of every splat of a tile to its slot."""
     tile = tl.load(order + tl.program_id(0))
@@ -169,7 +170,7 @@ def field_of(total, field):
 @triton.jit(do_not_specialize=["count"])
 def total_kernel(
     sums, slot_ends, ids, records, totals, g_means2d, absgrad, count,
-    WITH_ABSGRAD: tl.constexpr, SPLATS: tl.constexpr, SLOTS: tl.constexpr, LANES: tl.constexpr,
+    WITH_ABSGRAD: constexpr, SPLATS: constexpr, SLOTS: constexpr, LANES: constexpr,
 ):  # fmt: skip
     """Add up the slots of some splats, and derive the gradients of their projected centres.
 

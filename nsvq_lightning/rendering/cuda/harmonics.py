@@ -5,6 +5,7 @@ The constant coefficients begin at ``first``, the higher ones at ``row``, with t
 
 import triton
 import triton.language as tl
+from triton.language import constexpr
 
 from nsvq_lightning.compute.formulas import for_triton
 from nsvq_lightning.rendering import formulas as shared
@@ -13,7 +14,7 @@ formulas = for_triton(shared)
 
 
 @triton.jit
-def places(SIZE: tl.constexpr):
+def places(SIZE: constexpr):
     """The numbers ``[SIZE]`` of what this program works on, where each program has as many."""
     return tl.program_id(0).to(tl.int64) * SIZE + tl.arange(0, SIZE)
 
@@ -50,7 +51,7 @@ def add_bands(row, first, basis, rgb, mask):
 
 
 @triton.jit
-def color(first, row, d, mask, DEGREE: tl.constexpr):
+def color(first, row, d, mask, DEGREE: constexpr):
     """0.5 + Σ coefficient·basis at unit direction d, before the clamp at 0."""
     r, g, b = load_row(first, 3, mask)
     rgb = (r * formulas.C0 + 0.5, g * formulas.C0 + 0.5, b * formulas.C0 + 0.5)
@@ -80,7 +81,7 @@ def put_bands(rows, first, basis, rgb, masks):
 
 
 @triton.jit
-def color_backward(g_first, rows, d, rgb, masks, DEGREE: tl.constexpr):
+def color_backward(g_first, rows, d, rgb, masks, DEGREE: constexpr):
     """Store the gradients of the coefficients from those of the colour; returns that of the direction d.
 
     ``rows`` are those of the higher coefficients and of their gradients, ``masks`` which coefficients are read, and

@@ -7,6 +7,7 @@ import torch
 import triton
 import triton.language as tl
 from torch import Tensor
+from triton.language import constexpr
 
 from nsvq_lightning.compute.devices import COMPILE, to_device
 from nsvq_lightning.compute.formulas import for_triton
@@ -21,7 +22,7 @@ from nsvq_lightning.splats.splats import sh_degree_of
 
 formulas = for_triton(shared)
 # Places of the limits of slopes and of the near plane among the numbers of a camera.
-SLOPES, NEAR = tl.constexpr(15), tl.constexpr(19)
+SLOPES, NEAR = constexpr(15), constexpr(19)
 
 # Splats per program.
 BLOCK = 128
@@ -64,7 +65,7 @@ RADIUS_ONLY = -1
 @triton.jit(do_not_specialize=["n"])
 def project_kernel(
     means, quats, scales, logits, sh0, shN, view, fx, fy, cx, cy, width, height, n, stride, distances, size,
-    records, boxes, means2d, radii, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
+    records, boxes, means2d, radii, DEGREE: constexpr, BLOCK: constexpr,
 ):  # fmt: skip
     """Records, tile boxes and centres of the splats in view at their own rows; radii, 0 for the rest."""
     row = places(BLOCK)
@@ -97,7 +98,7 @@ def project_kernel(
 def project_backward_kernel(
     means, quats, scales, logits, shN, view, fx, fy, cx, cy, width, height, n, distances, size, ranks, records, totals,
     g_means2d, g_means, g_quats, g_scales, g_logits, g_sh0, g_shN,
-    STRIDE: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
+    STRIDE: constexpr, DEGREE: constexpr, BLOCK: constexpr,
 ):  # fmt: skip
     """Gradients of all attributes from the moments (``totals``, one slot each) of the splats in view.
 
@@ -118,8 +119,7 @@ def project_backward_kernel(
         trained_at = load_sampling(distances, size, row, n, seen)
     g_mean, g_quat, g_scale = formulas.geometry_backward(
         camera, (x, y, tl.where(seen, z, 1.0)), quat, scale, load_row(record + rec.A, 3, seen),
-        load_row(total + rec.SUM_UU, 3, seen), h, centre, load_if(total + rec.SUM_DEPTH, seen),
-        trained_at,
+        load_row(total + rec.SUM_UU, 3, seen), h, centre, load_if(total + rec.SUM_DEPTH, seen), trained_at,
     )  # fmt: skip
     store_row(g_scales + 3 * row, g_scale, inside)
     store_row(g_quats + 4 * row, g_quat, inside)
@@ -136,7 +136,7 @@ def project_backward_kernel(
 
 
 @triton.jit(do_not_specialize=["n"])
-def take_kernel(table, ids, n, taken, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
+def take_kernel(table, ids, n, taken, WIDTH: constexpr, BLOCK: constexpr):
     """Rows ``ids`` of a table; torch's own indexing takes ten times as long for rows of whole 16-byte words."""
     place, field = places(BLOCK), tl.arange(0, 16)
     row = load_if(ids + place, place < n)
@@ -316,7 +316,6 @@ def project_backward(
     if n:
         project_backward_kernel[(triton.cdiv(n, BLOCK),)](
             means, quats, scales, logits, shN, *lens, n, *(sampling or NO_SAMPLING), ranks, records, totals, g_means2d,
-            *gradients,
-            STRIDE=3 * shN.shape[1], DEGREE=degree, BLOCK=BLOCK, **COMPILE,
+            *gradients, STRIDE=3 * shN.shape[1], DEGREE=degree, BLOCK=BLOCK, **COMPILE,
         )  # fmt: skip
     return gradients

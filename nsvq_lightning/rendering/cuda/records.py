@@ -11,27 +11,27 @@ consecutive, so that its total is summed in one fixed order and no kernel needs 
 every time.
 """
 
-import triton.language as tl
+from triton.language import constexpr
 
 from nsvq_lightning.rendering import formulas
 
 # Stride between records, or slots, in floats: whole 16-byte words.
-RECORD = tl.constexpr(12)
+RECORD = constexpr(12)
 # Floats used in a record or slot.
-FIELDS = tl.constexpr(10)
+FIELDS = constexpr(10)
 # Stride between slots, in floats, with absolute gradients.
-ABSGRAD_SLOT = tl.constexpr(16)
+ABSGRAD_SLOT = constexpr(16)
 # Floats used in such a slot.
-ABSGRAD_FIELDS = tl.constexpr(13)
+ABSGRAD_FIELDS = constexpr(13)
 
 # Fields of a record.
-X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH = (tl.constexpr(field) for field in range(10))
+X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH = (constexpr(field) for field in range(10))
 
 # Fields of a slot: with h = α·dL/dα, sums over pixels of w·g (colour), h, h·u, h·v, h·u², h·u·v, h·v², w·g (depth) and,
 # with absolute gradients, |h·u|, |B·h·u + C·h·v|, w·pixel weight.
 SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_DEPTH, ABS_X, ABS_Y, SUM_WEIGHT = (
-    tl.constexpr(field) for field in range(13)
+    constexpr(field) for field in range(13)
 )
 
 # Side of a tile in pixels.
-TILE = tl.constexpr(formulas.TILE)
+TILE = constexpr(formulas.TILE)
