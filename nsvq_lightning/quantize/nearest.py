@@ -16,12 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import parallel, parts_of
 from nsvq_lightning.compute.memory import Array
 from nsvq_lightning.compute.rows import share
-from nsvq_lightning.compute.simd import fma, get, load, put
+from nsvq_lightning.compute.simd import broadcast, fma, get, load, minimum, put, where
 from nsvq_lightning.quantize.box_search import MAX_DIM, box_search, code_distances, place_of_least
 from nsvq_lightning.quantize.scores import score_search
 
@@ -158,13 +157,13 @@ def _search_kernel(dim: int) -> Any:
         blocks = table.shape[0] // (16 * (dim + 1))
         for i in range(*share(result.shape[0], part, parts)):
             price = get(prices, i)
-            best, block_of = simd.broadcast(np.inf), simd.broadcast(0)
+            best, block_of = broadcast(np.inf), broadcast(0)
             for block in range(blocks):
                 at = block * 16 * (dim + 1)
                 distances = code_distances(dim, table, at, x, i * dim)
                 total = fma(price, load(table, at + 16 * dim), distances)
-                block_of = simd.where(total < best, block, block_of)
-                best = simd.minimum(total, best)
+                block_of = where(total < best, block, block_of)
+                best = minimum(total, best)
             put(result, i, place_of_least(best, block_of))
 
     return parallel(search)

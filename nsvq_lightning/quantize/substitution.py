@@ -20,11 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import check_inside, check_tensor, flat, recycled
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside, share
-from nsvq_lightning.compute.simd import fma, get, load, put, store
+from nsvq_lightning.compute.simd import broadcast, fma, get, lane_sum, load, log2, put, sqrt, store, where
 from nsvq_lightning.quantize.scores import new_lanes
 
 _UNIT, _TINY, _MINUS_TWO_LN2 = F(2.0**-24), np.finfo(np.float32).tiny, F(-2 * np.log(2))
@@ -67,7 +66,7 @@ def fill_normal(seed, first, count, out):
     for pair in range(count // 2):
         at = pair * 32
         _uniforms(seed, (first // 2 + pair) * 16, out, at)
-        length = simd.sqrt(simd.log2(load(out, at)) * _MINUS_TWO_LN2)
+        length = sqrt(log2(load(out, at)) * _MINUS_TWO_LN2)
         turn = load(out, at + 16)
         store(out, at, length * _polynomial(_COS, turn * turn))
         store(out, at + 16, length * (turn * _polynomial(_SIN, turn * turn)))
@@ -96,7 +95,7 @@ def _outside(dim, x, rows, codebook, codes, begin, stop):
 @inline
 def _inverses(squared):
     """1/s, and 0 where s is 0 (or its inverse too large): a zero vector has no direction."""
-    return simd.where(squared > _TINY, 1 / squared, 0)
+    return where(squared > _TINY, 1 / squared, 0)
 
 
 @inline
@@ -110,14 +109,14 @@ def _short_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin,
             _take_row(dim, x, get(rows, first + lane) * dim, lane, values)
             _take_row(dim, codebook, get(codes, first + lane) * dim, lane, chosen)
         at = (first - begin) * dim
-        error = squared = simd.broadcast(0)
+        error = squared = broadcast(0)
         for j in range(dim):
             residual = load(chosen, 16 * j) - load(values, 16 * j)
             direction = fma(aim, residual, spread * load(noise, at + 16 * j))
             store(noise, at + 16 * j, direction)
             error = fma(residual, residual, error)
             squared = fma(direction, direction, squared)
-        length = simd.sqrt(error * _inverses(squared))
+        length = sqrt(error * _inverses(squared))
         for j in range(dim):
             store(values, 16 * j, fma(length, load(noise, at + 16 * j), load(values, 16 * j)))
         for lane in range(valid):
@@ -135,7 +134,7 @@ def _long_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, 
         if start == 0:
             fill_normal(seed, i * vectors, 2 * vectors, noise)
         at, code = get(rows, i) * dim, get(codes, i) * dim
-        error = squared = simd.broadcast(0)
+        error = squared = broadcast(0)
         for j in range(vectors):
             place = min(16 * j, dim - 16)
             residual = load(codebook, code + place) - load(x, at + place)
@@ -145,7 +144,7 @@ def _long_forward(dim, seed, aim, spread, x, rows, codebook, codes, out, begin, 
                 residual, way = residual * load(keep, 0), way * load(keep, 0)
             error = fma(residual, residual, error)
             squared = fma(way, way, squared)
-        length = simd.sqrt(simd.lane_sum(error) * _inverses(simd.broadcast(simd.lane_sum(squared))))
+        length = sqrt(lane_sum(error) * _inverses(broadcast(lane_sum(squared))))
         for j in range(vectors):
             place = min(16 * j, dim - 16)
             store(out, i * dim + place, fma(length, load(direction, place), load(x, at + place)))
@@ -178,7 +177,7 @@ def _short_backward(dim, grad, x, rows, codebook, codes, out, grad_x, sums, begi
             _take_row(dim, codebook, get(codes, i) * dim, lane, chosen)
             _take_row(dim, out, i * dim, lane, moved)
             _take_row(dim, grad, i * dim, lane, slope)
-        dots = squared = simd.broadcast(0)
+        dots = squared = broadcast(0)
         for j in range(dim):
             value = load(values, 16 * j)
             dots = fma(load(slope, 16 * j), load(moved, 16 * j) - value, dots)
@@ -204,7 +203,7 @@ def _long_backward(dim, grad, x, rows, codebook, codes, out, grad_x, sums, begin
     keep = new_lanes(dim)
     for i in range(begin, stop):
         at, code = get(rows, i) * dim, get(codes, i) * dim
-        dots = squared = simd.broadcast(0)
+        dots = squared = broadcast(0)
         for j in range(vectors):
             place = min(16 * j, dim - 16)
             value, slope = load(x, at + place), load(grad, i * dim + place)
@@ -213,7 +212,7 @@ def _long_backward(dim, grad, x, rows, codebook, codes, out, grad_x, sums, begin
                 residual, slope = residual * load(keep, 0), slope * load(keep, 0)
             dots = fma(slope, load(out, i * dim + place) - value, dots)
             squared = fma(residual, residual, squared)
-        scale = simd.lane_sum(dots) * _inverses(simd.broadcast(simd.lane_sum(squared)))
+        scale = lane_sum(dots) * _inverses(broadcast(lane_sum(squared)))
         clear_between(rows, i, dim, grad_x)
         # The last two vectors overlap, so the last sums are read before any are written.
         last = load(sums, code + dim - 16)
