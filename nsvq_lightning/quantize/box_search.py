@@ -20,7 +20,7 @@ from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
 from nsvq_lightning.compute.memory import INT32, INT64, Array, aligned_empty, check_array, check_inside, check_table
 from nsvq_lightning.compute.rows import count_outside
-from nsvq_lightning.compute.simd import fma, get, integer, load, put, store
+from nsvq_lightning.compute.simd import fma, get, integer, lane_min, load, lowest_bit, mask_bits, put, store
 
 # Factor on the bounds, far above the relative rounding error of a float32 distance.
 ROUNDING = 1.0 + 1e-5
@@ -132,11 +132,11 @@ def _visit_leaf(dim, tree, leaf, x, i, limit, state):
     codes, labels, _, _ = tree
     best, label, second, _, _, scratch, _ = state
     distances = code_distances(dim, codes, leaf * dim * 16, x, i * dim)
-    bits = simd.mask_bits(distances <= limit)
+    bits = mask_bits(distances <= limit)
     if bits != 0:
         store(scratch, 0, distances)
         while bits != 0:
-            lane = simd.lowest_bit(bits)
+            lane = lowest_bit(bits)
             bits &= bits - 1
             distance, code = get(scratch, lane), get(labels, leaf * 16 + lane)
             smallest = get(best, i)
@@ -151,10 +151,10 @@ def _visit_leaf(dim, tree, leaf, x, i, limit, state):
 @inline
 def place_of_least(least, block_of):
     """Where the least of blocks of 16 numbers is, the first of equal ones; lanes hold their least and its block."""
-    smallest = simd.lane_min(least)
-    block = simd.lane_min(simd.where(least <= smallest, block_of, np.inf))
-    lane = simd.mask_bits((least <= smallest) & (block_of <= block))
-    return np.int64(block) * 16 + simd.lowest_bit(lane)
+    smallest = lane_min(least)
+    block = lane_min(simd.where(least <= smallest, block_of, np.inf))
+    lane = mask_bits((least <= smallest) & (block_of <= block))
+    return np.int64(block) * 16 + lowest_bit(lane)
 
 
 @inline
@@ -192,14 +192,14 @@ def _guess(dim, tree, x, count, state):
     for i in range(count):
         node = get(guess, i)
         distances = _box_distances(dim, leaves, node * 32 * dim, x, i * dim)
-        lane = simd.lowest_bit(simd.mask_bits(distances <= simd.lane_min(distances)))
+        lane = lowest_bit(mask_bits(distances <= lane_min(distances)))
         put(guess, i, node * 16 + lane)
     for i in range(count):
         leaf = get(guess, i)
         distances = code_distances(dim, codes, leaf * dim * 16, x, i * dim)
-        limit = simd.lane_min(distances)
+        limit = lane_min(distances)
         if bounded:
-            limit = simd.lane_min(simd.where(distances > limit, distances, np.inf))
+            limit = lane_min(simd.where(distances > limit, distances, np.inf))
         put(best, i, np.inf)
         put(label, i, _NO_CODE)
         put(second, i, np.inf)
@@ -231,13 +231,13 @@ def _visit_near(dim, tree, x, count, state):
     for i in range(count):
         row, limit = i * dim, _limit(i, state)
         for group in range(nodes.size // (32 * dim)):
-            near_nodes = simd.mask_bits(_box_distances(dim, nodes, group * 32 * dim, x, row) <= limit)
+            near_nodes = mask_bits(_box_distances(dim, nodes, group * 32 * dim, x, row) <= limit)
             while near_nodes != 0:
-                node = group * 16 + simd.lowest_bit(near_nodes)
+                node = group * 16 + lowest_bit(near_nodes)
                 near_nodes &= near_nodes - 1
-                near_leaves = simd.mask_bits(_box_distances(dim, leaves, node * 32 * dim, x, row) <= limit)
+                near_leaves = mask_bits(_box_distances(dim, leaves, node * 32 * dim, x, row) <= limit)
                 while near_leaves != 0:
-                    leaf = node * 16 + simd.lowest_bit(near_leaves)
+                    leaf = node * 16 + lowest_bit(near_leaves)
                     near_leaves &= near_leaves - 1
                     put(tasks, 2 * pending, i)
                     put(tasks, 2 * pending + 1, leaf)

@@ -17,6 +17,7 @@ from nsvq_lightning.compute.rows import clear_between, share
 from nsvq_lightning.compute.simd import fma, fnma, get, integer, load, prefetch, put, store
 from nsvq_lightning.rendering import formulas
 from nsvq_lightning.rendering.cpu import records as rec
+from nsvq_lightning.rendering.cpu.records import get3, record_of
 from nsvq_lightning.rendering.formulas import TILE, TRANSMITTANCE_MIN, TWO_LN2, dot3, exponent, fma3
 
 BATCH = 128
@@ -65,7 +66,7 @@ def in_tile(records, r, corner):
 
     The factors of its exponent are u = A·x + B·y + u0 and v = C·y + v0.
     """
-    a, b, c = rec.get3(records, r + rec.A)
+    a, b, c = get3(records, r + rec.A)
     x, y = get(records, r + rec.X) - F(corner[0]), get(records, r + rec.Y) - F(corner[1])
     return x, y, (a, b, c, -(a * x + b * y), -(c * y))
 
@@ -86,7 +87,7 @@ def reachable_blocks(batch, o, x, y, grid):
     dy = simd.maximum(top, simd.minimum(bottom, 0))
     along_y = simd.maximum(top, simd.minimum(bottom, get(batch, o + rec.SLOPE_X) * dx))
     along_x = simd.maximum(left, simd.minimum(right, get(batch, o + rec.SLOPE_Y) * dy))
-    a, b, c = rec.get3(batch, o + rec.A)
+    a, b, c = get3(batch, o + rec.A)
     first, _, _ = exponent(a, b, c, 0, 0, 0, dx, along_y)
     second, _, _ = exponent(a, b, c, 0, 0, 0, along_x, dy)
     peak = simd.maximum(first, second)
@@ -96,7 +97,7 @@ def reachable_blocks(batch, o, x, y, grid):
 @inline
 def alpha_at(batch, r, x, y):
     """α of one splat of a batch on a block of pixels, 0 below 1/255; a batch holds (u0, v0) in place of the centre."""
-    a, b, c = rec.get3(batch, r + rec.A)
+    a, b, c = get3(batch, r + rec.A)
     u0, v0, peak = get(batch, r + rec.X), get(batch, r + rec.Y), get(batch, r + rec.LOG2_OPACITY)
     power, _, _ = exponent(a, b, c, u0, v0, peak, x, y)
     _, alpha = formulas.alpha_of(power)
@@ -127,7 +128,7 @@ def blend_one(batch, r, alpha, t, after, kept):
     left, color, depth = kept
     open_ = after >= TRANSMITTANCE_MIN
     weight = simd.where(open_, alpha * t, 0)
-    color = fma3(weight, rec.get3(batch, r + rec.RED), color)
+    color = fma3(weight, get3(batch, r + rec.RED), color)
     depth = fma(weight, get(batch, r + rec.DEPTH), depth)
     return simd.where(open_, after, left), color, depth
 
@@ -193,7 +194,7 @@ def write_block(block, corner, size, background, state, planes):
     o = 16 * block
     x0, y0 = block_corner(block, corner)
     t = load(state, T_LEFT + o)
-    color = fma3(t, rec.get3(background, 0), load_color(state, o))
+    color = fma3(t, get3(background, 0), load_color(state, o))
     if x0 + BLOCK_SIDE <= width and y0 + BLOCK_SIDE <= height:
         pixel = y0 * width + x0
         simd.store_block3(image, 3 * pixel, 3 * width, color)
@@ -250,15 +251,15 @@ def blend(
     store(batch, BATCH * rec.RECORD, 0)
     put(batch, BATCH * rec.RECORD + rec.LOG2_OPACITY, F(-100))
     for i in range(begin, min(end, begin + AHEAD)):
-        prefetch(records, rec.record_of(entries, i))
+        prefetch(records, record_of(entries, i))
     i = begin
     while i < end and alive != 0:
         count = min(BATCH, end - i)
         reached = 0
         for j in range(count):
             if i + j + AHEAD < end:
-                prefetch(records, rec.record_of(entries, i + j + AHEAD))
-            r = rec.record_of(entries, i + j)
+                prefetch(records, record_of(entries, i + j + AHEAD))
+            r = record_of(entries, i + j)
             o = rec.RECORD * j
             store(batch, o, load(records, r))
             center_x, center_y, (_, _, _, u0, v0) = in_tile(records, r, corner)
@@ -357,7 +358,7 @@ def splat_backward(records, row, blocks, corner, wanted, state):
     _, _, (a, b, c, u0, v0) = in_tile(records, r, corner)
     peak = get(records, r + rec.LOG2_OPACITY)
     z = get(records, r + rec.DEPTH)
-    color = rec.get3(records, r + rec.RED)
+    color = get3(records, r + rec.RED)
     s_color = s_squares = zero, zero, zero
     s_h, s_u, s_v, s_z = zero, zero, zero, zero
     s_ax, s_ay, s_map = zero, zero, zero
@@ -399,7 +400,7 @@ def tile_backward(records, integers, entries, begin, end, corner, group, wanted,
     """Add up the gradients of all splats of a tile, front to back."""
     for i in range(begin, end):
         if i + AHEAD < end:
-            prefetch(records, rec.record_of(entries, i + AHEAD))
+            prefetch(records, record_of(entries, i + AHEAD))
         if i + SLOT_AHEAD < end:
             prefetch(sums, rec.RECORD * slot_of(integers, integer(entries, i + SLOT_AHEAD), group))
         blocks = integer(touched, i)
@@ -452,7 +453,7 @@ def total_slots(part, parts, ids, slots, records, integers, sums, g_means2d, wit
         slot = integer(integers, r + rec.SLOT)
         end = np.int64(slots)
         if i + 1 < count:
-            end = integer(integers, rec.record_of(ids, i + 1) + rec.SLOT)
+            end = integer(integers, record_of(ids, i + 1) + rec.SLOT)
         o = rec.RECORD * slot
         if end > slot + 1:
             total = load(sums, o)
@@ -460,7 +461,7 @@ def total_slots(part, parts, ids, slots, records, integers, sums, g_means2d, wit
                 total = total + load(sums, rec.RECORD * other)
             store(sums, o, total)
         u, v = get(sums, o + rec.SUM_U), get(sums, o + rec.SUM_V)
-        a, b, c = rec.get3(records, r + rec.A)
+        a, b, c = get3(records, r + rec.A)
         put(g_means2d, 2 * row, TWO_LN2 * a * u)
         put(g_means2d, 2 * row + 1, TWO_LN2 * (b * u + c * v))
         if with_absgrad:
