@@ -7,6 +7,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+from numpy.linalg import norm
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -53,7 +54,7 @@ class _Photo(NamedTuple):
     def rays(self, pixels: Float64s) -> Float64s:
         """Unit directions ``[M, 3]`` in the world of pixels ``[M, 2]``."""
         local = np.c_[(pixels - self.centre) / self.focal, np.ones(len(pixels))]
-        return local / np.linalg.norm(local, axis=1, keepdims=True) @ self.rotation  # type: ignore[no-any-return]
+        return local / norm(local, axis=1, keepdims=True) @ self.rotation  # type: ignore[no-any-return]
 
 
 # Candidates over all flows; of more pixels than that, every third, fourth, ... row and column is taken.
@@ -169,7 +170,7 @@ def _neighbours(photos: list[_Photo], baseline: float, turned: float, most: int)
     axes = np.array([photo.rotation[2] for photo in photos])
     pairs = set()
     for i, photo in enumerate(photos):
-        base = np.linalg.norm(positions - photo.position, axis=1)
+        base = norm(positions - photo.position, axis=1)
         angle = np.degrees(np.arccos(np.clip(axes @ axes[i], -1, 1)))
         # Any nearer, there is no parallax.
         usable = (base > 0.02 * photo.depth) & (base < baseline * photo.depth) & (angle < turned)
@@ -199,7 +200,7 @@ def _followed(a: _Photo, b: _Photo, there: Float32s, back: Float32s, stride: int
     ends = starts + flow
     returned = flow + cv2.remap(back, ends, None, cv2.INTER_LINEAR)
     inside = (ends > 1) & (ends < np.array(b.grey.shape[::-1]) - 2)
-    good = (np.linalg.norm(returned, axis=2) < MAX_ERROR) & inside.all(2)
+    good = (norm(returned, axis=2) < MAX_ERROR) & inside.all(2)
     if a.counts is not None:
         good &= a.counts
     if b.counts is not None:
@@ -240,7 +241,7 @@ def _triangulated(a: _Photo, b: _Photo, start: Float64s, end: Float64s) -> _Poin
     least, largest = (share * a.depth for share in DEPTHS)
     kept = (depths_a > least) & (depths_b > least) & (depths_a < largest)
     for pixels, expected in ((pixels_a, start), (pixels_b, end)):
-        kept &= np.linalg.norm(pixels - expected, axis=1) < MAX_ERROR
+        kept &= norm(pixels - expected, axis=1) < MAX_ERROR
     columns, rows = start[kept].astype(np.intp).T
     return points[kept], a.image[rows, columns], a.detail[rows, columns]
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.linalg import norm
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -50,7 +51,7 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     if len({camera.size for camera in cameras}) > 1:
         raise ValueError("cameras of a path must have one size; reframe them first")
     positions, rotations = poses(cameras)
-    unit = float(np.median(np.linalg.norm(positions - positions.mean(0), axis=1))) or 1.0
+    unit = float(np.median(norm(positions - positions.mean(0), axis=1))) or 1.0
     steps = _steps(positions, rotations, unit)
     kept = np.r_[True, steps > 1e-6]
     positions, rotations = positions[kept], rotations[kept]
@@ -73,7 +74,7 @@ def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 def _steps(positions: Float64s, rotations: Rotation, unit: float) -> Float64s:
     """How far it is from each pose to the next, a turn by one radian counting as much as the distance ``unit``."""
     turns = (rotations[:-1].inv() * rotations[1:]).magnitude() if len(positions) > 1 else 0.0
-    return np.linalg.norm(np.diff(positions, axis=0), axis=1) / unit + turns  # type: ignore[no-any-return]
+    return norm(np.diff(positions, axis=0), axis=1) / unit + turns  # type: ignore[no-any-return]
 
 
 def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
@@ -94,7 +95,7 @@ def orbit(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     positions, _ = poses(cameras)
     middle, up = looked_at(cameras), up_of(cameras)
     across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    across /= np.linalg.norm(across)
+    across /= norm(across)
     ahead = np.cross(up, across)
     arms = positions - middle
     x, y = arms @ across, arms @ ahead

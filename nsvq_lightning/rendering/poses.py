@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -31,7 +32,7 @@ def looked_at(cameras: Sequence[Camera]) -> Float64s:
     forward = rotations.as_matrix()[:, :, 2]
     ahead = forward.mean(0)
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    spread = np.linalg.norm(arms, axis=1).max() or 1.0
+    spread = norm(arms, axis=1).max() or 1.0
     weight = LEVEL * len(positions)
     total = across.sum(0) + weight * np.eye(3)
     met = np.linalg.solve(total, np.einsum("nij,nj->i", across, arms) + weight * (2 * spread * ahead))
@@ -48,24 +49,24 @@ def up_of(cameras: Sequence[Camera]) -> Float64s:
     """
     axes = poses(cameras)[1].as_matrix()
     right, upper, forward = axes[:, :, 0], -axes[:, :, 1].mean(0), axes[:, :, 2].mean(0)
-    if np.linalg.norm(upper) < 0.3 and np.linalg.norm(forward) > 0.9:
-        return np.asarray(-forward / np.linalg.norm(forward))
-    if np.linalg.norm(upper) < 0.1:  # they are turned in all directions
+    if norm(upper) < 0.3 and norm(forward) > 0.9:
+        return np.asarray(-forward / norm(forward))
+    if norm(upper) < 0.1:  # they are turned in all directions
         return -axes[0, :, 1]  # type: ignore[no-any-return]
     weights = np.ones(len(axes))
     for _ in range(20):  # weighted again by how level they are
         level = (weights * right.T) @ right / weights.sum()
         up = np.linalg.solve(level + LITTLE * np.eye(3), upper)
-        up /= np.linalg.norm(up)
+        up /= norm(up)
         weights = 1 / np.maximum(np.abs(right @ up), 0.02)  # sine of the roll below which a camera counts as level
     return up
 
 
 def view_towards(target: Float64s, eye: Float64s, up: Float64s) -> Tensor:
     """World to camera ``[4, 4]`` float32: from ``eye [3]`` a camera looks at ``target [3]``, with ``up [3]`` above."""
-    forward = (target - eye) / (np.linalg.norm(target - eye) or 1.0)
+    forward = (target - eye) / (norm(target - eye) or 1.0)
     right = np.cross(forward, up)
-    right /= np.linalg.norm(right) or 1.0
+    right /= norm(right) or 1.0
     return view_from(np.stack([right, np.cross(forward, right), forward], axis=1), eye)
 
 

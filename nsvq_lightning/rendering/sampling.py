@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.linalg import norm
 
 from nsvq_lightning.splats.conventions import Float64s
 
@@ -127,13 +128,13 @@ def fewer_cameras(cameras: Float64s) -> Float64s:
     """Those of cameras ``[C, 4]`` that :func:`trained_by` keeps."""
     if len(cameras) == 0:
         return cameras
-    apart = np.linalg.norm(cameras[:, :3] - np.median(cameras[:, :3], axis=0), axis=1)
+    apart = norm(cameras[:, :3] - np.median(cameras[:, :3], axis=0), axis=1)
     spread = apart.max()
     # A lens that magnifies e times is as far from another as the cameras' spread.
     positions = np.c_[cameras[:, :3], (spread or 1) * np.log(cameras[:, 3])]
     chosen = [apart.argmax()]
-    apart = np.linalg.norm(positions - positions[chosen[0]], axis=1)
+    apart = norm(positions - positions[chosen[0]], axis=1)
     while len(chosen) < MAX_CAMERAS and apart.max() > NEAR_ENOUGH * spread:
         chosen.append(apart.argmax())
-        apart = np.minimum(apart, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
+        apart = np.minimum(apart, norm(positions - positions[chosen[-1]], axis=1))
     return cameras[np.sort(chosen)]  # type: ignore[no-any-return]
