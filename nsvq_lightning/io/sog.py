@@ -97,7 +97,15 @@ def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
     }
     pictures = {name: _picture(values) for name, values in texels.items()}
     if scene.sh_degree:
-        meta["shN"], sh_pictures = _packed_sh(*_palette(scene, palette), scene.sh_degree)
+        rows, labels = _palette(scene, palette)
+        indices, levels = _leveled(rows, np.bincount(labels, minlength=len(rows))[:, None])
+        shape = math.ceil(len(rows) / _ROWS_A_LINE), _ROWS_A_LINE * sh_coefficients(scene.sh_degree)
+        sh_pictures = {
+            "shN_centroids.webp": _picture(indices.reshape(-1, 3), shape),
+            "shN_labels.webp": _picture(_low_and_high(labels)),
+        }
+        files = list(sh_pictures)
+        meta["shN"] = {"count": len(rows), "bands": scene.sh_degree, "codebook": levels, "files": files}
         pictures |= sh_pictures
     contents = {META: json.dumps(meta, separators=(",", ":"), allow_nan=False).encode()}
     for name, picture in pictures.items():
@@ -340,17 +348,6 @@ def _leveled(values: Float32s, weight: Integers | int = 1) -> tuple[Uint8s, list
 
     levels = scalar_kmeans(values, weight, _LEVELS)
     return nearest_level(values, levels), [float(str(level)) for level in levels]
-
-
-def _packed_sh(rows: Float32s, labels: Int64s, sh_degree: int) -> tuple[Json, dict[str, Uint8s]]:
-    """What ``meta.json`` says of a palette ``[K, D]`` and labels ``[N]``, and their pictures by name."""
-    indices, levels = _leveled(rows, np.bincount(labels, minlength=len(rows))[:, None])
-    shape = math.ceil(len(rows) / _ROWS_A_LINE), _ROWS_A_LINE * sh_coefficients(sh_degree)
-    pictures = {
-        "shN_centroids.webp": _picture(indices.reshape(-1, 3), shape),
-        "shN_labels.webp": _picture(_low_and_high(labels)),
-    }
-    return {"count": len(rows), "bands": sh_degree, "codebook": levels, "files": list(pictures)}, pictures
 
 
 def _picture(texels: Uint8s, shape: tuple[int, int] | None = None) -> Uint8s:

@@ -13,7 +13,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, check_start, naming_file
 from nsvq_lightning.io.numbers import logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, UP_AXES, rotated
-from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, sh_coefficients, unit
+from nsvq_lightning.splats.conventions import Arrays, Float32s, sh_coefficients, unit
 from nsvq_lightning.top_level import log
 
 _ROWS = 1 << 12
@@ -102,7 +102,12 @@ def read_usda(path: StrPath) -> CompressedScene:
         try:
             colors = colors.reshape(len(rows["means"]), -1)
             rows |= {"sh0": colors[:, :3], "shN": colors[:, 3:]}
-            return rotated(CompressedScene.from_rows(rows, "bool antialiased = 1" in prim), _to_ours(about))
+            scene = CompressedScene.from_rows(rows, "bool antialiased = 1" in prim)
+            # What takes the axes of the stage to ours, and its unit to metres where it states one.
+            turn = HALF_TURN @ UP_AXES["z"] if re.search(r"\bupAxis\s*=\s*.Z", about) else HALF_TURN
+            if found := re.search(r"\bmetersPerUnit\s*=\s*([-+.\deE]+)", about):
+                turn = turn * float(found[1])
+            return rotated(scene, turn)
         except ValueError as error:
             raise FormatError(f"truncated or damaged: {error}") from None
 
@@ -118,12 +123,3 @@ def _rows(text: str, name: str, width: int) -> Float32s:
             except ValueError as error:
                 raise FormatError(f"damaged: {name} ({error})") from None
     raise FormatError(f"truncated: {name} has no end" if name in text else f"no attribute {name}")
-
-
-def _to_ours(text: str) -> Float64s:
-    """What takes the axes and the unit of the stage to ours, and to metres where it states a unit ``[3, 3]``."""
-    turn = HALF_TURN
-    if re.search(r"\bupAxis\s*=\s*.Z", text):
-        turn = HALF_TURN @ UP_AXES["z"]
-    found = re.search(r"\bmetersPerUnit\s*=\s*([-+.\deE]+)", text)
-    return turn * float(found[1]) if found else turn

@@ -177,14 +177,6 @@ def _settle(dim, x, row, codebook, scores, codes, at, kept, limit):
 
 
 @inline
-def _compare_all(dim, x, row, codebook):
-    code, distance = 0, F(np.inf)
-    for candidate in range(codebook.shape[0] // dim):
-        code, distance = closer(dim, x, row, codebook, code, distance, candidate)
-    return code
-
-
-@inline
 def _reach(squared, score, margin):
     """Distance of a row to codes with a score, less what rounding may have added."""
     return np.sqrt(max(F(0.0), squared + F(2.0) * (score - margin)))
@@ -225,7 +217,10 @@ def _search_kernel(dim: int) -> Any:
             if others > limit:
                 result[row] = _settle(dim, x, row, codebook, scores, codes, at, kept, limit)
             else:
-                result[row] = _compare_all(dim, x, row, codebook)
+                code, distance = 0, F(np.inf)
+                for candidate in range(codebook.shape[0] // dim):
+                    code, distance = closer(dim, x, row, codebook, code, distance, candidate)
+                result[row] = code
             if with_lists:
                 for k in range(LIST):
                     lists[row * LIST + k] = codes[at + k] if scores[at + k] < F(np.inf) else codes[at]
