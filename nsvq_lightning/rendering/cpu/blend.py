@@ -17,7 +17,7 @@ from nsvq_lightning.compute.rows import clear_between, share
 from nsvq_lightning.compute.simd import fma, fnma, get, integer, load, prefetch, put, store
 from nsvq_lightning.rendering import formulas
 from nsvq_lightning.rendering.cpu import records as rec
-from nsvq_lightning.rendering.cpu.records import get3, record_of
+from nsvq_lightning.rendering.cpu.records import RECORD, get3, record_of
 from nsvq_lightning.rendering.formulas import TILE, TRANSMITTANCE_MIN, TWO_LN2, dot3, exponent, fma3
 
 BATCH = 128
@@ -44,7 +44,7 @@ def pixel_grid() -> np.ndarray[tuple[int], np.dtype[np.float32]]:
     return np.concatenate([x.ravel(), y.ravel(), x[:, 0], y[:, 0]]).astype(np.float32)
 
 
-FORWARD_SCRATCH = 6 * 256 + (BATCH + 1) * rec.RECORD
+FORWARD_SCRATCH = 6 * 256 + (BATCH + 1) * RECORD
 BACKWARD_SCRATCH = BLOCKS * BLOCK_STATE
 
 
@@ -160,7 +160,7 @@ def blend_block(block, count, batch, grid, state, touched, first):
         j1, queue = next_splat(queue)
         j2, queue = next_splat(queue)
         j3, queue = next_splat(queue)
-        r0, r1, r2, r3 = rec.RECORD * j0, rec.RECORD * j1, rec.RECORD * j2, rec.RECORD * j3
+        r0, r1, r2, r3 = RECORD * j0, RECORD * j1, RECORD * j2, RECORD * j3
         a0, a1 = alpha_at(batch, r0, x, y), alpha_at(batch, r1, x, y)
         a2, a3 = alpha_at(batch, r2, x, y), alpha_at(batch, r3, x, y)
         t1 = fnma(a0, t, t)
@@ -248,8 +248,8 @@ def blend(
             alive |= 1 << block
     batch = state[6 * 256 :]
     # A record without effect, which fills up the last group of four.
-    store(batch, BATCH * rec.RECORD, 0)
-    put(batch, BATCH * rec.RECORD + rec.LOG2_OPACITY, F(-100))
+    store(batch, BATCH * RECORD, 0)
+    put(batch, BATCH * RECORD + rec.LOG2_OPACITY, F(-100))
     for i in range(begin, min(end, begin + AHEAD)):
         prefetch(records, record_of(entries, i))
     i = begin
@@ -260,7 +260,7 @@ def blend(
             if i + j + AHEAD < end:
                 prefetch(records, record_of(entries, i + j + AHEAD))
             r = record_of(entries, i + j)
-            o = rec.RECORD * j
+            o = RECORD * j
             store(batch, o, load(records, r))
             center_x, center_y, (_, _, _, u0, v0) = in_tile(records, r, corner)
             mask = alive
@@ -341,7 +341,7 @@ def start_block(block, corner, size, planes, gradients, pixel_weights, wanted, g
 @inline
 def slot_of(integers, row, group):
     """The slot in which a group sums the gradients of a splat."""
-    o = rec.RECORD * row
+    o = RECORD * row
     origin, extent = integer(integers, o + rec.ORIGIN), integer(integers, o + rec.EXTENT)
     x0, y0 = origin & 0xFFFF, origin >> 16
     first_x, first_y = x0 >> rec.GROUP_SHIFT, y0 >> rec.GROUP_SHIFT
@@ -354,7 +354,7 @@ def splat_backward(records, row, blocks, corner, wanted, state):
     """Sums of one splat over the blocks it changed in a tile (the fields of a slot); advances the blocks' state."""
     _, with_depth, with_absgrad = wanted
     zero = simd.broadcast(0)
-    r = rec.RECORD * row
+    r = RECORD * row
     _, _, (a, b, c, u0, v0) = in_tile(records, r, corner)
     peak = get(records, r + rec.LOG2_OPACITY)
     z = get(records, r + rec.DEPTH)
@@ -402,12 +402,12 @@ def tile_backward(records, integers, entries, begin, end, corner, group, wanted,
         if i + AHEAD < end:
             prefetch(records, record_of(entries, i + AHEAD))
         if i + SLOT_AHEAD < end:
-            prefetch(sums, rec.RECORD * slot_of(integers, integer(entries, i + SLOT_AHEAD), group))
+            prefetch(sums, RECORD * slot_of(integers, integer(entries, i + SLOT_AHEAD), group))
         blocks = integer(touched, i)
         if blocks == 0:
             continue
         row = integer(entries, i)
-        slot = rec.RECORD * slot_of(integers, row, group)
+        slot = RECORD * slot_of(integers, row, group)
         store(sums, slot, load(sums, slot) + splat_backward(records, row, blocks, corner, wanted, state))
 
 
@@ -449,16 +449,16 @@ def total_slots(part, parts, ids, slots, records, integers, sums, g_means2d, wit
         clear_between(ids, i, 2, g_means2d)
         if with_absgrad:
             clear_between(ids, i, 3, absgrad)
-        r = rec.RECORD * row
+        r = RECORD * row
         slot = integer(integers, r + rec.SLOT)
         end = np.int64(slots)
         if i + 1 < count:
             end = integer(integers, record_of(ids, i + 1) + rec.SLOT)
-        o = rec.RECORD * slot
+        o = RECORD * slot
         if end > slot + 1:
             total = load(sums, o)
             for other in range(slot + 1, end):
-                total = total + load(sums, rec.RECORD * other)
+                total = total + load(sums, RECORD * other)
             store(sums, o, total)
         u, v = get(sums, o + rec.SUM_U), get(sums, o + rec.SUM_V)
         a, b, c = get3(records, r + rec.A)
