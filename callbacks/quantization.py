@@ -261,7 +261,7 @@ def _refittable(module: SplatModule) -> dict[str, Any]:
 
 # How often sensitivities are measured in the phase.
 MEASUREMENTS = 3
-# Most train views in which a measurement renders the splats.
+# Train views in which a measurement renders the splats, or a fourth of them where that is more.
 VIEWS = 32
 # Iterations in which every splat has its codes chosen once.
 TURNS = 8
