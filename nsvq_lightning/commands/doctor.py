@@ -1,4 +1,4 @@
-"""Check whether this machine is fit for training, and whether a COLMAP folder is a good scene.
+"""Check whether this machine is fit for training, and whether a folder is a good scene.
 
 Each line is good, a note (works, could be better or faster) or a problem (a run would fail, or miss something).
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Add what ``nsvq doctor`` takes."""
-    parser.add_argument("folder", nargs="?", type=Path, metavar="FOLDER", help="COLMAP folder to check")
+    parser.add_argument("folder", nargs="?", type=Path, metavar="FOLDER", help="scene folder to check")
 
 
 def run(options: Namespace) -> int:
