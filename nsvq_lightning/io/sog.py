@@ -230,11 +230,12 @@ class _Archive:
         if not (isinstance(files, list) and len(files) > number and isinstance(files[number], str)):
             raise FormatError(f"damaged: {META} does not name the pictures of {attribute!r}")
         name = files[number]
-        # Twice the bytes that uncompressed texels have.
-        data = self._bytes(name, 8 * max(FEW_SPLATS, self._size // 2))
+        # Those of splats, or of the rows of the largest palette; and twice the bytes that uncompressed ones have.
+        most = max(self._size // 2, FEW_SPLATS, 15 * PALETTE_LIMIT)
+        data = self._bytes(name, 8 * most)
         try:
             with Image.open(BytesIO(data), formats=("WEBP", "PNG")) as image:
-                check_room("splats or texels", image.width * image.height, self._size)
+                check_room("texels", image.width * image.height, self._size, most)
                 return np.asarray(image.convert("RGBA"))
         except FormatError:
             raise

@@ -11,6 +11,7 @@ import pytest
 from compressed_scenes import arrays_of
 from numpy.typing import NDArray
 from PIL import Image
+from splat_scenes import random_splats
 from viewer_scenes import coded_scene, plain_scene
 
 from nsvq_lightning.io import CompressedScene, FormatError, read_scene, save
@@ -43,6 +44,15 @@ def picture(texels: NDArray[np.uint8], kind: str = "WEBP", width: int = 8) -> by
 
 def texels(data: bytes) -> NDArray[np.uint8]:
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGBA")).reshape(-1, 4).copy()
+
+
+def test_a_palette_may_have_more_texels_than_the_file_has_bytes(tmp_path: Path) -> None:
+    """15 for each of up to 65536 rows, also where splats are few."""
+    splats = random_splats(18_000, sh_degree=3)
+    splats.shN[:] = 0.2 * splats.shN.sign()
+    save(splats, path := tmp_path / "x.sog")
+    assert 15 * len(splats.means) > max(1 << 18, path.stat().st_size // 2)
+    np.testing.assert_allclose(abs(read_scene(path).rows("shN")), 0.2, atol=0.01)
 
 
 @pytest.mark.parametrize("bands", range(4))
