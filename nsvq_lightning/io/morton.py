@@ -170,7 +170,8 @@ def spatial_order(means: Float32s) -> Integers:
     """Indices ``[N]`` of splats in Morton order of their positions ``[N, 3]``; equal ones keep their order.
 
     Those that are twice, four times, … as far out as four fifths of the splats follow, so that what few of them would
-    stretch the bounds of is theirs alone.
+    stretch the bounds of is theirs alone; those within an eighth, a sixteenth, … of that come first, as what is near
+    before a far background.
     """
     from nsvq_lightning.rendering.frame import middle_of
 
@@ -180,4 +181,4 @@ def spatial_order(means: Float32s) -> Integers:
     keys = morton_keys(cells, np.full(len(means), AXIS_BITS))
     middle, usual = middle_of(means)
     _, doublings = np.frexp(np.linalg.norm(means - middle, axis=1) / max(usual, 1e-30) / 2)
-    return np.lexsort((keys, doublings.clip(0)))
+    return np.lexsort((keys, np.maximum(doublings, (doublings + 3).clip(None, 0))))

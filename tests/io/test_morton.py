@@ -89,6 +89,14 @@ def test_splats_in_spatial_order_are_near_the_one_before() -> None:
         assert np.quantile(steps, 0.95) < 10  # in random order 39
 
 
+def test_what_is_near_before_a_far_background_keeps_its_positions(tmp_path: Path) -> None:
+    """A thing in front of a landscape that has nine tenths of the splats and is 1000 times as large."""
+    scene = plain_scene(4000, 0)
+    alone = _errors(scene.in_order(np.arange(400)), tmp_path / "a.compressed.ply")
+    scene.means[400:] *= 1000 / np.linalg.norm(scene.means[400:], axis=1, keepdims=True)
+    assert _errors(scene, tmp_path / "b.compressed.ply")[:256].max() < 3 * alone.max()
+
+
 def test_lost_splats_are_the_last(tmp_path: Path) -> None:
     """So they stretch no bounds of others: chunks of 256 in a compressed .ply."""
     scene = plain_scene(4000, 0)
