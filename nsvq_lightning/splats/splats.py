@@ -143,7 +143,9 @@ class Splats(nn.Module):
         odd = colors.max() if colors.min() >= 0 else colors.min()
         if not 0 <= odd <= 1:
             raise ValueError(f"colours of points are up to {odd:g}, not in [0, 1]: divide bytes by 255")
-        spread = _mean_squared_neighbour_distance(points).clamp(1e-7, 4.0)
+        spread = _mean_squared_neighbour_distance(points)
+        # Where cameras stand in one place, all that they show is many units away.
+        spread = spread.clamp(1e-7, max(4.0, 10 * float(spread.median())))
         return cls.from_tensors(
             means=points,
             quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),

@@ -107,6 +107,16 @@ def test_what_is_not_finite_stays_so_and_changes_no_other() -> None:
         assert all(torch.equal(a[row], b[row]) for a, b in zip(found, expected, strict=True))
 
 
+@pytest.mark.parametrize(("step", "limit"), [(0.1, 2.0), (20.0, 20 * math.sqrt(10))])
+def test_no_first_splat_is_much_larger_than_is_usual(step: float, limit: float) -> None:
+    """Where somebody stands in one place and turns, all that is shown is far away in units of the cameras."""
+    lines = torch.arange(100.0)[:, None] * torch.tensor([step, 0.0, 0.0])
+    points = torch.cat([lines, torch.tensor([[0.0, 0.0, 1e4]])])
+    sizes = Splats.from_points(points, torch.full_like(points, 0.5)).scales.exp()[:, 0]
+    assert sizes[50].item() == pytest.approx(step * math.sqrt(2), rel=1e-4)  # of one, one and two steps
+    assert sizes[-1].item() == pytest.approx(limit * (math.sqrt(2) if step > 1 else 1), rel=1e-4)
+
+
 def test_first_splats_are_as_large_as_their_distance_says() -> None:
     corners = torch.tensor([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)])
     points = torch.cat([torch.tensor([[math.nan, 0.0, 0.0]]), corners, corners[:1]])  # one not finite, one twice
