@@ -74,13 +74,15 @@ def share_seen(points: Float64s, cameras: list[Camera]) -> float:
 
 # Points of a scene that comes without.
 RANDOM_POINTS = 20_000
+# Where cameras look away from each other, as from the middle of a room, they show what is so many times as far away.
+OUTWARD = 10
 
 
 def random_points(cameras: list[Camera]) -> Float64s:
     """:data:`RANDOM_POINTS` points ``[P, 3]`` in the volume that the cameras see together, always the same ones.
 
     Candidates are spread over the views, up to twice as far away as what the cameras look at, which is where their
-    optical axes come closest to each other; those that most cameras see are kept.
+    optical axes come closest to each other, or :data:`OUTWARD` times as far; those that most cameras see are kept.
 
     Args:
         cameras: At least one.
@@ -91,6 +93,9 @@ def random_points(cameras: list[Camera]) -> Float64s:
     # The cameras look at where their axes meet, or as far away as their own extent if that is farther.
     typical = np.median(np.linalg.norm(centres - looked_at(cameras), axis=1))
     distance = max(typical, np.linalg.norm(centres - centres.mean(0), axis=1).max(), 1e-6)
+    ahead = ((looked_at(cameras) - centres) * rotations.as_matrix()[:, :, 2]).sum(1)
+    if np.quantile(ahead, 0.8) < 0:  # in eight rooms two fifths of the cameras look away from their middle
+        distance *= OUTWARD
     chosen = torch.randint(len(cameras), (count,), generator=draws).numpy()
     across, down, away = torch.rand(3, count, generator=draws, dtype=torch.float64).numpy()
     fx, fy, cx, cy = np.array([camera.intrinsics for camera in cameras])[chosen].T

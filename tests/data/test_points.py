@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nsvq_lightning.compression.viewpoints import look_at
 from nsvq_lightning.data.colmap import SceneError
 from nsvq_lightning.data.points import random_points, read_points, share_seen
 from nsvq_lightning.data.scene import load_scene
@@ -92,3 +93,13 @@ def test_random_points_fill_what_the_cameras_see_together(demo_scene: Path) -> N
     # Parallel axes meet nowhere.
     ahead = [camera for camera in cameras[:1] for _ in range(3)]
     assert share_seen(random_points(ahead), ahead) == 1
+
+
+def test_random_points_of_somebody_who_turns_in_place_are_far_away() -> None:
+    """A phone that is held at arm's length shows the room, not what lies between its places."""
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    eyes = 0.5 * np.stack([np.cos(angles), np.sin(angles), np.zeros(24)], 1)
+    away = random_points([look_at(3 * eye, eye, 64, 48, 1.0) for eye in eyes])
+    inwards = random_points([look_at(0 * eye, eye, 64, 48, 1.0) for eye in eyes])
+    assert np.median(np.linalg.norm(inwards, axis=1)) < 0.5
+    assert 1.5 < np.median(np.linalg.norm(away, axis=1)) < 10
