@@ -98,8 +98,13 @@ class _Cache(kernel_cache.KernelCache):
 
 @cache
 def _start_threads() -> None:
-    """Start Numba's threads, which tells OpenMP to use all cores, and give torch its own setting back."""
+    """Start Numba's threads, which tells OpenMP to use all cores, and give torch its own setting back.
+
+    Processes that are forked from now on have none of these, and would wait for them for ever: they use one.
+    """
     _started.append(os.getpid())
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
     count = torch.get_num_threads()
     numba.set_num_threads(numba.get_num_threads())
     torch.set_num_threads(count)
@@ -113,8 +118,9 @@ def check_threads() -> None:
     """
     if _started and os.getpid() not in _started:
         raise RuntimeError(
-            "kernels have run in this notebook before, and a process that is started now would lack their threads: "
-            "restart it and fit before anything is rendered, or fit on one device (devices=1)"
+            "kernels have run before this process was forked, and it lacks their threads: start it by spawn "
+            '(multiprocessing.get_context("spawn")); in a notebook restart it and fit before anything is rendered, or '
+            "fit on one device (devices=1)"
         )
 
 

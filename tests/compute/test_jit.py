@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -27,6 +28,30 @@ def test_numba_leaves_the_number_of_threads_as_it_was(threads: int) -> None:
     in_torch, in_kernels = map(int, ran.stdout.split())
     assert in_torch == threads
     assert 1 <= in_kernels <= threads
+
+
+FORKED = """
+import multiprocessing
+import nsvq_lightning as nl
+import torch
+torch.set_num_threads(2)
+from splat_scenes import front_camera, random_splats
+splats = random_splats(500)
+def shown(number):
+    image = nl.render(splats, front_camera()).image
+    return float(image.double().mean()), float(torch.ones(1 << 22).cumsum(0)[-1])
+own = shown(0)
+with multiprocessing.get_context("fork").Pool(2) as pool:
+    assert pool.map_async(shown, range(2)).get(60) == [own, own]
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+def test_a_process_that_is_forked_after_a_render_renders() -> None:
+    """It has none of the threads of the other one, which it would wait for."""
+    support = str(Path(__file__).parents[1] / "support")
+    paths = os.pathsep.join([*sys.path, support])
+    subprocess.run([sys.executable, "-c", FORKED], check=True, timeout=120, env=os.environ | {"PYTHONPATH": paths})
 
 
 FEW_PARTS = """
