@@ -21,7 +21,7 @@ BINARY_REMEDY = "write it as text: usdcat -o scene.usda FILE"
 PRIM = "ParticleField3DGaussianSplat"
 _COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
 # Strings and comments.
-_WORDS = re.compile(r"""(\"{3}|'{3}|["'])(?:\\.|.)*?\1|\#[^\n]*""", re.DOTALL)
+_WORDS = re.compile(r"""(\"{3}|'{3}|["'])(?:\\.|(?!\1).)*+\1|\#[^\n]*""", re.DOTALL)
 
 
 def write_usda(path: StrPath, scene: CompressedScene) -> int:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -45,6 +46,19 @@ def test_another_text_is_refused(tmp_path: Path) -> None:
         (tmp_path / "y.usda").write_text(wrong)
         with pytest.raises(FormatError, match=r"y\.usda: (0 prims of the kind|no attribute positions|truncated: )"):
             read_scene(tmp_path / "y.usda")
+
+
+def test_a_stray_quote_takes_no_memory_for_each_character_behind_it(tmp_path: Path) -> None:
+    save(plain_scene(3000, 1), tmp_path / "x.usda")
+    text = (tmp_path / "x.usda").read_text()
+    (tmp_path / "y.usda").write_text(text.replace("positions", 'posi"tions'))
+    tracemalloc.start()
+    try:
+        with pytest.raises(FormatError, match=r"y\.usda: "):
+            read_scene(tmp_path / "y.usda")
+        assert tracemalloc.get_traced_memory()[1] < 20 * len(text)
+    finally:
+        tracemalloc.stop()
 
 
 def _changed(path: Path, change: Callable[[str], str]) -> CompressedScene:
