@@ -78,12 +78,14 @@ class RunStart(SaveConfigCallback):
             self.config["ckpt_path"] = None  # who repeats a run does not continue it
             self._write(folder)
 
-    def on_train_end(self, trainer: Trainer, pl_module: SplatModule) -> None:  # type: ignore[override]
-        """Note how many iterations the minutes have come to."""
-        if self.by_minutes:
+    def on_train_end(self, trainer: Trainer, pl_module: SplatModule, *_: Any) -> None:  # type: ignore[override]
+        """Note how many iterations the minutes have come to, also for those who continue the run."""
+        if self.by_minutes and trainer.global_step:
             self.config["callbacks.phases.init_args.total"] = pl_module.schedule.total
             self.config["trainer.max_steps"] = trainer.max_steps + pl_module.schedule.saved
             self._write(run_folder(trainer))
+
+    on_exception = on_train_end  # type: ignore[assignment]
 
     def _write(self, folder: Path) -> None:
         with optional(folder / self.config_filename) as path:

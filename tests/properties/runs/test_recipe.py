@@ -354,3 +354,26 @@ def test_a_run_of_some_minutes_can_be_repeated(
     phases = settings["callbacks"]["phases"]["init_args"]
     assert phases["total"] == round(6 / forecast.LOOP) <= settings["trainer"]["max_steps"]
     assert phases["minutes"] is phases["iterations_per_photo"] is None
+
+
+def test_a_run_of_some_minutes_that_is_interrupted_goes_on_to_the_end_it_has_chosen(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(forecast, "step_seconds", lambda scene, count, device: 1.0)
+    before_step = PhaseSchedule.before_step
+
+    def stop(phases: PhaseSchedule, trainer: Trainer, module: SplatModule, iteration: int) -> None:
+        before_step(phases, trainer, module, iteration)
+        phases._steps = trainer.max_steps + 1
+        if iteration == 3:
+            raise RuntimeError("interrupted")
+
+    monkeypatch.setattr(PhaseSchedule, "before_step", stop)
+    folder = tmp_path / "run"
+    options = ["--splats=300", "--model.codebooks=null", f"--trainer.run_folder={folder}", "--callbacks.report=null"]
+    with pytest.raises(RuntimeError, match="interrupted"):
+        main(["fit", f"--data.root={demo_scene}", "--minutes=0.1", *options])
+    settings = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    total = round(6 / forecast.LOOP)
+    assert settings["callbacks"]["phases"]["init_args"]["total"] == total
+    assert settings["trainer"]["max_steps"] > total
