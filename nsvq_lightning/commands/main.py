@@ -1,5 +1,6 @@
 """The ``nsvq`` command. Kept light: ``nsvq info`` must answer without importing torch."""
 
+import atexit
 import gc
 import logging
 import os
@@ -38,6 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0, 1 after an error in the user's files, 130 after Ctrl-C, 143 after SIGTERM. Wrong arguments end
         the process with status 2.
     """
+    own_process = argv is None
     arguments = list(sys.argv[1:] if argv is None else argv)
     arguments = [text.replace("=~/", f"={os.path.expanduser('~')}/") for text in arguments]  # no shell does
     name = arguments[0] if arguments else ""
@@ -53,10 +55,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     # A pipe, too, shows lines as they come; on Windows it accepts only the locale's characters.
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="replace", line_buffering=True)
+    if own_process and hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
+        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))  # a terminal that was closed
     try:
         if name in OF_LIGHTNING or name.startswith("-"):
-            return _run_lightning(arguments, own_process=argv is None)
+            return _run_lightning(arguments, own_process)
         if name in COMMANDS:
+            if own_process:
+                signal.signal(signal.SIGTERM, _end)
             return run_command(name, arguments[1:])
         return _failed(f"error: there is no command {name!r}{nearest(name, COMMANDS)}\nAll commands: nsvq --help", 2)
     except KeyboardInterrupt:
@@ -75,6 +81,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.name != "cv2":
             raise
         return _failed("error: OpenCV (cv2) is missing: pip install opencv-contrib-python-headless, or any other")
+
+
+def _end(number: int, frame: Any) -> None:
+    """Have a command remove what is unfinished, and then end the process as this signal does."""
+    signal.signal(number, signal.SIG_DFL)
+    atexit.register(signal.raise_signal, number)
+    raise KeyboardInterrupt
 
 
 def _failed(message: str, status: int = 1) -> int:

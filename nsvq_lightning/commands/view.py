@@ -150,12 +150,13 @@ class _Handler(BaseHTTPRequestHandler):
     followed = False
 
     def do_GET(self) -> None:
+        path = urlsplit(self.path).path  # messengers add a query to a link
         if not _is_own(self.headers.get("Host", ""), self.host):
             self._answer(403, b"open the address that nsvq view has printed")
-        elif self.path == "/":
+        elif path == "/":
             self._answer(200, self.page, "text/html; charset=utf-8")
-        elif self.path in ("/scene.nsvq", "/version"):
-            self._scene(self.path == "/version")
+        elif path in ("/scene.nsvq", "/version"):
+            self._scene(path == "/version")
         else:
             self._answer(404, b"there is no such page")
 

@@ -1,6 +1,10 @@
 from __future__ import annotations
 
+import os
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 import urllib.error
@@ -62,6 +66,29 @@ def test_a_run_that_cannot_be_asked_says_why(run: Path, address: str, monkeypatc
     monkeypatch.setattr(viewer, "ask_live", ask_live)
     status, text = _get(f"{address}/version")
     assert (status, text.startswith(b"the run cannot be asked: [Errno 13] Permission denied")) == (503, True)
+
+
+def test_a_query_behind_the_address_changes_nothing(address: str) -> None:
+    assert _get(f"{address}/?from=chat") == _get(f"{address}/")
+    assert _get(f"{address}/version?now")[0] == 503
+    assert _get(f"{address}/else?from=chat")[0] == 404
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="this system closes no terminals")
+@pytest.mark.parametrize("number", ["SIGTERM", "SIGHUP"])
+def test_the_end_of_a_terminal_leaves_no_file(tmp_path: Path, number: str) -> None:
+    """A .ply is shown as a copy in .nsvq."""
+    save(random_splats(5), tmp_path / "scene.ply")
+    (copies := tmp_path / "copies").mkdir()
+    command = [sys.executable, "-m", "nsvq_lightning", "view", str(tmp_path / "scene.ply"), "--no-open", "--port=0"]
+    environment = os.environ | {"TMPDIR": str(copies), "PYTHONPATH": str(Path(__file__).parents[2])}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        assert "http" in process.stdout.readline()
+        assert list(copies.glob("*/scene.nsvq"))
+        process.send_signal(getattr(signal, number))
+        assert process.wait(30) == -signal.SIGTERM
+    assert not list(copies.glob("*"))
 
 
 def test_a_running_fit_is_asked_until_its_scene_is_there(run: Path, address: str) -> None:
