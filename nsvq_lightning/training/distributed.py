@@ -7,7 +7,7 @@ from typing import TypeVar
 import torch
 import torch.distributed
 from lightning.pytorch import Trainer
-from lightning.pytorch.strategies import DDPStrategy, Strategy, StrategyRegistry
+from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy, Strategy, StrategyRegistry
 from torch import Tensor, nn
 from torch.distributed import all_reduce
 
@@ -22,13 +22,13 @@ def check_strategy(strategy: Strategy) -> None:
     """Refuse a strategy that would lose the parameters that callbacks replace.
 
     Raises:
-        ValueError: The strategy wraps the module in ``DistributedDataParallel``.
+        ValueError: The strategy wraps the module, as in ``DistributedDataParallel``.
     """
-    if isinstance(strategy, DDPStrategy) and not isinstance(strategy, ViewParallelStrategy):
+    if not isinstance(strategy, SingleDeviceStrategy | ViewParallelStrategy):
         raise ValueError(
-            "DistributedDataParallel binds gradient hooks to the parameters it finds at the start: after the first "
-            "clone it crashes or silently stops averaging. Write nsvq_lightning.SplatTrainer(…), which chooses by "
-            'itself, or Trainer(devices=1, …), or Trainer(strategy="view_parallel", …), in a notebook '
+            "A wrapper such as DistributedDataParallel binds gradient hooks to the parameters it finds at the start: "
+            "after the first clone it crashes or silently stops averaging. Write nsvq_lightning.SplatTrainer(…), which "
+            'chooses by itself, or Trainer(devices=1, …), or Trainer(strategy="view_parallel", …), in a notebook '
             '"view_parallel_notebook"; for nsvq fit --trainer.devices=1 or --trainer.strategy=view_parallel'
         )
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch import LightningModule
-from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy, StrategyRegistry
+from lightning.pytorch.strategies import DDPStrategy, FSDPStrategy, SingleDeviceStrategy, StrategyRegistry
 from torch import Tensor, nn
 
 import nsvq_lightning.training.distributed as strategies
@@ -178,6 +178,8 @@ def test_a_quantizer_takes_over_the_first_one_with_fewer_codes() -> None:
 def test_ddp_is_refused_with_the_reason() -> None:
     with pytest.raises(ValueError, match=r"silently stops averaging.*strategy=view_parallel"):
         check_strategy(DDPStrategy())
+    with pytest.raises(ValueError, match="A wrapper such as"):
+        check_strategy(FSDPStrategy())
     check_strategy(SingleDeviceStrategy())
     check_strategy(ViewParallelStrategy())
 
