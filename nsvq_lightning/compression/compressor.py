@@ -475,8 +475,8 @@ def compress(
         left: How many splats are left; None leaves all.
         antialiased: Whether the splats are rendered with anti-aliasing.
         background: What they are shown in front of, in ``photos``, too.
-        settings: ``seed`` (0), ``minutes`` (no limit; those of ``nsvq compress`` are 2) and ``steps`` (500, or 1500 with
-            fewer splats) of :class:`Compressor`.
+        settings: ``seed`` (0), ``minutes`` (no limit; 2 in ``nsvq compress``) and ``steps`` (500, or 1500 with fewer
+            splats) of :class:`Compressor`.
 
     Raises:
         ValueError: The splats are empty or not finite, cameras do not show them, photos do not fit the cameras, or a
