@@ -288,14 +288,14 @@ class ImageSource:
             mask = read_mask(self.mask, self.size)
             kept = mask if kept is None else kept & mask
         if self.undistortion:
-            image, kept = self.undistortion(image, kept)
+            image, kept = self.undistortion(*resized(image, kept, self.undistortion.size))
         image, kept = resized(image, kept, (self.pinhole.width, self.pinhole.height))
         if kept is None or kept.all():
             return Picture(torch.from_numpy(image), None)
         if not kept.any():
             raise SceneError(
-                f"no pixel of {self.path} counts{'' if self.mask is None else f' by its mask {self.mask}'}: masks are "
-                "white where the photo counts and black elsewhere; mend it, or remove the photo from the model"
+                f"no pixel of {self.path} counts by its {f'mask {self.mask}' if self.mask else 'transparency'}: masks "
+                "are white and photos opaque where the photo counts; mend it, or remove the photo from the model"
             )
         return Picture(torch.from_numpy(image * kept[..., None]), torch.from_numpy(kept))
 

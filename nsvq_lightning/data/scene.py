@@ -408,7 +408,10 @@ def _image_sources(
     for number, size in dict.fromkeys(kinds):
         full, undistortion = rectify(model.cameras[number], *size, keep_maps=keep_maps)
         odd += _odd_lens(number, full, size)
-        lenses[number, size] = undistortion, _scaled(full, divisor, max_width)
+        lens = _scaled(full, divisor, max_width)
+        if undistortion:
+            undistortion.scale_to(lens)
+        lenses[number, size] = undistortion, lens
     if odd:
         log.warning(f"{odd[0]}{f' ({len(odd) - 1} more are odd)' if odd[1:] else ''}")
     return [

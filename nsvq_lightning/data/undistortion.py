@@ -39,6 +39,10 @@ class Undistortion:
     The pinhole camera is the one of COLMAP's ``image_undistorter`` with its default options. Distortion is evaluated in
     the model's pixels, so the image file may have another size than the model says, even another aspect ratio.
 
+    Attributes:
+        size: Width and height of the images that it takes, pixels.
+        pinhole: Camera of the pictures that it makes.
+
     Args:
         camera: Distorted ``pycolmap.Camera``.
         width: Width of the image files in pixels.
@@ -60,15 +64,26 @@ class Undistortion:
                 f"({error}): {remedy}"
             ) from error
         self._camera = camera
-        self._size = (width, height)
+        self.size = (width, height)
         self._scale = (width / camera.width, height / camera.height)
         self.pinhole = Pinhole(ideal.calibration_matrix(), ideal.width, ideal.height).scaled(*self._scale)
         self._keep_maps = keep_maps
         self._maps: tuple[Float32s, Float32s, Bools] | None = None
         self._warned = False
 
+    def scale_to(self, pinhole: Pinhole) -> None:
+        """Have it make pictures of a smaller pinhole camera, of images that were made smaller by as much.
+
+        Maps and pictures of large photos would take gigabytes, most of which is thrown away.
+        """
+        scale = pinhole.width / self.pinhole.width
+        width, height = (max(1, round(scale * side)) for side in self.size)
+        self.size = (width, height)
+        self._scale = (width / self._camera.width, height / self._camera.height)
+        self.pinhole, self._maps = pinhole, None
+
     def __call__(self, image: Uint8s, kept: Bools | None = None) -> tuple[Uint8s, Bools | None]:
-        """Undistort an image ``[H, W, 3]`` of the file's size, and say which pixels of the result count.
+        """Undistort an image ``[H, W, 3]`` of its size, and say which pixels of the result count.
 
         Args:
             image: The image; pixels that the camera never saw become black.
@@ -98,7 +113,7 @@ class Undistortion:
             return self._maps
         pixels = self._source_pixels()
         # a pixel or more from the centres of the border, or NaN where the ray leaves the domain of the camera model
-        blank = ~np.all((pixels > -1) & (pixels < self._size), axis=-1)
+        blank = ~np.all((pixels > -1) & (pixels < self.size), axis=-1)
         columns, rows = (np.nan_to_num(pixels[..., i], nan=-1.0) for i in (0, 1))
         if blank.any() and not self._warned:
             self._warned = True

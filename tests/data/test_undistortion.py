@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap
+from nsvq_lightning.data.images import resized
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.data.undistortion import rectify
 
@@ -63,6 +64,29 @@ def test_no_blank_pixel_is_left(model: str, params: tuple[float, ...]) -> None:
     _, undistortion = rectify(_camera(model, params), 400, 300)
     assert undistortion is not None
     assert (undistortion(np.full((300, 400, 3), 200, np.uint8))[0] == 200).all()
+
+
+@pytest.mark.parametrize("model", DISTORTED)
+def test_a_photo_that_is_made_small_is_undistorted_afterwards(model: str) -> None:
+    """Oracle: the other way round, which takes many times the memory of the result."""
+    camera, image = _camera(model, DISTORTED[model]), _picture(1200, 900)
+    kept = np.ones((900, 1200), bool)
+    kept[:, 500:560] = False
+    pinhole, undistortion = rectify(camera, 1200, 900)
+    assert undistortion is not None
+    small = pinhole.scaled(1 / 3, 1 / 3)
+    expected, counted = resized(*undistortion(image, kept), (small.width, small.height))
+    undistortion.scale_to(small)
+    assert undistortion.size == (400, 300)
+    found, counts = undistortion(*resized(image, kept, undistortion.size))
+    assert found.shape == expected.shape
+    assert counts is not None
+    assert counted is not None
+    assert (counts ^ counted).mean() < 0.01
+    difference = np.abs(found.astype(int) - expected)[2:-2, 2:-2]
+    assert difference.mean() < 1.5
+    shifted = np.abs(found[:, 1:].astype(int) - expected[:, :-1])[2:-2, 2:-2]
+    assert difference.mean() < 0.15 * shifted.mean()
 
 
 @pytest.mark.parametrize(
