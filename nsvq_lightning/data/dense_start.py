@@ -94,7 +94,8 @@ def dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
     try:
         photos = in_parallel(lambda index: _photo(scene, index, known), scene.train, "dense start: photos")
         pairs = _neighbours(photos, *NEAR)
-        stride = max(2, math.ceil(math.sqrt(2 * len(pairs) * photos[0].grey.size / MAX_CANDIDATES)))
+        pixels = max(photo.grey.size for photo in photos)
+        stride = max(2, math.ceil(math.sqrt(2 * len(pairs) * pixels / MAX_CANDIDATES)))
         found = in_parallel(lambda pair: _flows(*pair, stride), pairs, "dense start: flows")
         by_flow = sum(len(points) for points, *_ in chain(*found))
         pairs = _neighbours(photos, *WIDE) if scene.grey else []
