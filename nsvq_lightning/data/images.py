@@ -133,8 +133,10 @@ def _decoded(path: Path, flags: int) -> Arrays:
             # OpenCV applies the orientation to TIFFs even when told not to.
             applied = int(head.getexif().get(Base.Orientation, 1)) if head.format == "TIFF" else 1
             _check_whole(data)
-            if head.format == "TIFF" and head.mode == "RGBA":
-                image = cv2.cvtColor(np.asarray(head), cv2.COLOR_RGBA2BGRA)  # OpenCV would multiply colours by alpha
+            grey = head.mode == "LA" or (head.mode == "L" and "transparency" in head.info)
+            if (head.format == "TIFF" and head.mode == "RGBA") or (grey and flags == cv2.IMREAD_UNCHANGED):
+                # OpenCV would multiply colours by alpha, or leave it out.
+                image = cv2.cvtColor(np.asarray(head.convert("RGBA")), cv2.COLOR_RGBA2BGRA)
             else:
                 image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:

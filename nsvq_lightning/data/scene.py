@@ -400,6 +400,11 @@ def _image_sources(
         heads = [head_for(*each, as_shown=True) for each in sized]
         turned = sum(head.orientation != 1 for head in heads)
         log.info(f"{turned} of {len(heads)} photos are turned by their EXIF orientation, as their cameras are")
+    elif lying := sum(head_for(path, size[::-1], as_shown=True).orientation != 1 for path, size in sized):
+        log.warning(
+            f"{lying} of {len(heads)} photos are stored on their side, as are their cameras, and so the scene: nsvq "
+            "prepare turns those of another folder"
+        )
     if others := sum(not same_shape(head.size, size) for head, (_, size) in zip(heads, sized, strict=True)):
         log.warning(f"{others} of {len(heads)} photos {OTHER_SHAPE}")
     kinds = [(image.camera_id, head.size) for image, head in zip(model.images, heads, strict=True)]

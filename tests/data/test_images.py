@@ -106,6 +106,22 @@ def test_colours_are_not_those_before_black(tmp_path: Path, suffix: str) -> None
     np.testing.assert_array_equal(read_image(path), RGB)
 
 
+@pytest.mark.parametrize(("mode", "suffix"), [("LA", ".png"), ("LA", ".tif"), ("L", ".png")])
+def test_grey_photos_may_be_transparent(tmp_path: Path, mode: str, suffix: str) -> None:
+    path = tmp_path / f"x{suffix}"
+    if mode == "L":
+        PIL.Image.fromarray(GREY).save(path, transparency=int(GREY[2, 3]))
+        clear = GREY[2, 3] == GREY
+    else:
+        clear = np.arange(54).reshape(6, 9) % 5 == 0
+        PIL.Image.fromarray(np.dstack([GREY, np.where(clear, 0, 255).astype(np.uint8)]), "LA").save(path)
+    assert image_head(path).has_alpha
+    picture = ImageSource(path, (9, 6), None, Pinhole(np.eye(3), 9, 6), has_alpha=True).load()
+    assert picture.mask is not None
+    np.testing.assert_array_equal(picture.mask, ~clear)
+    np.testing.assert_array_equal(picture.image, np.repeat((GREY * ~clear)[..., None], 3, axis=2))
+
+
 def test_a_picture_may_have_the_pixels_of_a_phone(tmp_path: Path) -> None:
     PIL.Image.new("1", (16_320, 12_240)).save(tmp_path / "x.png")
     assert image_head(tmp_path / "x.png").size == (16_320, 12_240)

@@ -324,6 +324,8 @@ def test_views_without_a_picture_are_left_out(
             write_masks(root, ["004.png"], np.zeros((32, 40), np.uint8))
         case _:
             assert cv2.imwrite(str(photo), np.zeros((32, 40, 4), np.uint8))
+            with pytest.raises(SceneError, match="counts by its transparency: masks are white and photos opaque"):
+                load_scene(root).view(4)
     scene = usable(load_scene(root))
     assert (scene.train, scene.test) == ((1, 2, 3, 5, 6, 7), (0, 8))
     assert scene.names == whole.names
@@ -799,7 +801,22 @@ def test_photos_are_turned_where_their_cameras_are(
     with PIL.Image.open(root / "images/000.png") as stored:
         shown = np.asarray(PIL.ImageOps.exif_transpose(stored)).astype(int)
     assert np.abs(scene.view(0).image.numpy() - shown).max() < 25
+    assert "stored on their side" not in caplog.text
     assert load_scene(make_scene("stored", views=2)).images.sources[0].orientation == 1
+    assert "stored on their side" not in caplog.text
+
+
+def test_photos_on_their_side_with_cameras_that_are_too_are_told(
+    make_scene: SceneFactory, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As those of a phone that COLMAP was run on by itself: the whole scene lies."""
+    root = make_scene(views=3, size=(32, 40))
+    tags = PIL.Image.Exif()
+    tags[274] = 6
+    for number in range(2):
+        PIL.Image.fromarray(np.zeros((40, 32, 3), np.uint8)).save(root / f"images/00{number}.png", "JPEG", exif=tags)
+    assert [source.orientation for source in load_scene(root).images.sources] == [1, 1, 1]
+    assert "2 of 3 photos are stored on their side, as are their cameras, and so the scene: nsvq prepare" in caplog.text
 
 
 @pytest.mark.parametrize("orientation", [2, 3, 4])
