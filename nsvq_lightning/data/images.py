@@ -4,6 +4,7 @@ import struct
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageCms
 from PIL.ExifTags import Base
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
@@ -22,6 +23,7 @@ from nsvq_lightning.data.colmap import Pinhole, SceneError
 from nsvq_lightning.data.undistortion import Undistortion
 from nsvq_lightning.io.atomic import make_folder_of, write_bytes
 from nsvq_lightning.splats.conventions import Arrays, Bools, Uint8s
+from nsvq_lightning.top_level import log
 
 # Pillow refuses twice as many, and by default fewer than phones have.
 Image.MAX_IMAGE_PIXELS = 1 << 27
@@ -109,6 +111,21 @@ def read_image(path: Path) -> Uint8s:
     """
     pixels = _to_bytes(_decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))
     return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)  # type: ignore[no-any-return]
+
+
+@cache
+def _to_srgb(profile: bytes) -> ImageCms.ImageCmsTransform | None:
+    """What takes colours of a photo to those of sRGB, which all viewers show; None if they are, or nothing says it."""
+    try:
+        own = ImageCms.ImageCmsProfile(BytesIO(profile))
+        name = ImageCms.getProfileDescription(own).strip()
+        if "srgb" in name.lower():
+            return None
+        turn = ImageCms.buildTransform(own, ImageCms.createProfile("sRGB"), "RGB", "RGB")
+    except (OSError, ImageCms.PyCMSError):
+        return None
+    log.info(f"photos are in the colours of {name}, and are turned into those of sRGB, which viewers show")
+    return turn
 
 
 def _decoded(path: Path, flags: int) -> Arrays:
@@ -292,6 +309,9 @@ class ImageSource:
         if self.undistortion:
             image, kept = self.undistortion(*resized(image, kept, self.undistortion.size))
         image, kept = resized(image, kept, (self.pinhole.width, self.pinhole.height))
+        with Image.open(self.path) as head:
+            if turn := _to_srgb(head.info.get("icc_profile", b"")):
+                image = np.array(ImageCms.applyTransform(Image.fromarray(image), turn))
         if kept is None or kept.all():
             return Picture(torch.from_numpy(image), None)
         if not kept.any():

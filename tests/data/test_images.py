@@ -13,6 +13,7 @@ import PIL.Image
 import pytest
 import torch
 from numpy.typing import NDArray
+from PIL import ImageCms
 
 from nsvq_lightning.data.colmap import Pinhole, SceneError
 from nsvq_lightning.data.images import (
@@ -104,6 +105,27 @@ def test_colours_are_not_those_before_black(tmp_path: Path, suffix: str) -> None
     np.testing.assert_array_equal(picture.image, RGB)
     assert picture.mask is None or picture.mask.all()
     np.testing.assert_array_equal(read_image(path), RGB)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_colours_of_another_profile_become_those_of_srgb(
+    tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Here of a device whose red shines green, and whose green red."""
+    caplog.set_level("INFO", logger="nsvq_lightning")
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    other = srgb.replace(b"rXYZ", b"tmp1").replace(b"gXYZ", b"rXYZ").replace(b"tmp1", b"gXYZ")
+    other = other.replace("sRGB".encode("utf-16-be"), suffix.encode("utf-16-be"))
+    pixels = np.full((6, 9, 3), (200, 60, 90), np.uint8)
+    seen = []
+    for number, profile in enumerate((None, srgb, other, b"damaged")):
+        path = tmp_path / f"{number}{suffix}"
+        PIL.Image.fromarray(pixels).save(path, quality=100, icc_profile=profile)
+        picture = ImageSource(path, (9, 6), None, Pinhole(np.eye(3), 9, 6)).load()
+        seen.append(picture.image[3, 4].tolist())
+    assert seen[0] == seen[1] == seen[3]
+    assert seen[2] == pytest.approx([seen[0][1], seen[0][0], seen[0][2]], abs=3)
+    assert caplog.text.count(f"in the colours of {suffix} built-in, and are turned into those of sRGB") == 1
 
 
 @pytest.mark.parametrize(("mode", "suffix"), [("LA", ".png"), ("LA", ".tif"), ("L", ".png")])

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import PIL.Image
+import PIL.ImageCms
 import pytest
 
 from nsvq_lightning.data import reconstruct
@@ -254,6 +255,22 @@ def _touch(folder: Path, *names: str) -> None:
 def _names_in(folder: Path) -> tuple[list[str], dict[str, list[str]]]:
     photos, left = photos_in(folder)
     return [path.relative_to(folder).as_posix() for path in photos], left
+
+
+def test_photos_that_are_turned_keep_their_colours(tmp_path: Path) -> None:
+    """Those of a profile are no longer the pixels' where these are converted to RGB."""
+    profile = PIL.ImageCms.ImageCmsProfile(PIL.ImageCms.createProfile("sRGB")).tobytes()
+    (source := tmp_path / "source").mkdir()
+    tags = PIL.Image.Exif()
+    tags[274] = 6
+    for mode in ("RGB", "CMYK"):
+        PIL.Image.new(mode, (8, 6)).save(source / f"{mode}.jpg", exif=tags, icc_profile=profile)
+    names, _ = copy_photos(photos_in(source)[0], source, tmp_path / "photos", _silent)
+    found = {}
+    for name in names:
+        with PIL.Image.open(tmp_path / "photos" / name) as photo:
+            found[name] = (photo.size, photo.mode, photo.info.get("icc_profile"))
+    assert found == {"CMYK.jpg": ((6, 8), "RGB", None), "RGB.jpg": ((6, 8), "RGB", profile)}
 
 
 def test_of_files_of_one_name_one_is_taken(tmp_path: Path) -> None:
