@@ -149,9 +149,9 @@ def decibels(error: float) -> float:
 
 # Splats that candidates are judged by, at most.
 SOME_DETAIL = 250_000
-# Where they stand, in spreads of the detail from its middle: around a scene, or inside it up to this.
+# Where they stand, in spreads of the detail from its middle, around a scene; inside it, between these shares of it.
 AROUND = 0.9, 3.0
-INSIDE = 0.8
+INSIDE = 0.05, 0.95
 # Splats farther from the middle of all, in distances that four fifths do not exceed, say nothing about it.
 STRAY = 10
 # Power of how much colours follow the line of sight to a place. With 4, bonsai lost 0.04 dB more.
@@ -170,7 +170,7 @@ def likely_cameras(splats: SplatTensors, count: int, width: int = 560, height: i
     A trained scene is sharp from where its photos were taken and blurred or empty from elsewhere. From there, its
     splats have about one size in pixels, and its colours follow the line of sight (:func:`_following`). Candidates are
     even in space and direction, as random ones decided 0.1 to 0.3 dB. Only where colours follow the line of sight to
-    the middle more than that to any place around, as in a room, candidates stand inside.
+    the middle more than that to any place around, as in a room, candidates stand inside, and look at the detail.
 
     Args:
         splats: Raw attributes of N > 0 splats.
@@ -192,15 +192,17 @@ def likely_cameras(splats: SplatTensors, count: int, width: int = 560, height: i
     even = torch.quasirandom.SobolEngine(7, scramble=True, seed=0).draw(5 * count)  # type: ignore[no-untyped-call]
     normal = torch.special.ndtri(even.double().clamp(1e-3, 1 - 1e-3))
     directions = normalize(normal[:, :3]).numpy()
-    away = AROUND[0] + (AROUND[1] - AROUND[0]) * even[:, 6:].numpy()
     some = RawSplats(*(spread(tensor, SOME_DETAIL).contiguous() for tensor in raw))
     following = _following(some)
     # On four scenes of objects, the middle has 0.3 to 0.7 times as much as the best of the farthest places, in a room
     # 1.75 times.
     if following(middle[None]) > following(middle + reach * AROUND[1] * directions).max():
-        away *= INSIDE / AROUND[1]
-    eyes = middle + reach * away * directions
-    targets = middle + reach * 0.4 * normal[:, 3:6].numpy()
+        targets = means[np.searchsorted(weights.cumsum(), even[:, 0].numpy()).clip(max=len(means) - 1)]
+        low, high = np.quantile(targets, INSIDE, axis=0)
+        eyes = low + (high - low) * even[:, 4:].numpy()
+    else:
+        eyes = middle + reach * (AROUND[0] + (AROUND[1] - AROUND[0]) * even[:, 6:].numpy()) * directions
+        targets = middle + reach * 0.4 * normal[:, 3:6].numpy()
     low = round(96 * height / width)
     details = np.array([_detail(some, look_at(*at, 96, low, ANGLE)) for at in zip(targets, eyes, strict=True)])
     scores = details * following(eyes) ** SHARPNESS * np.exp(-EVENNESS * _size_variances(some, eyes))
