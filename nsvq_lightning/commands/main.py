@@ -36,8 +36,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments; those of the process if None.
 
     Returns:
-        Exit status: 0, 1 after an error in the user's files, 130 after Ctrl-C, 143 after SIGTERM. Wrong arguments end
-        the process with status 2.
+        Exit status: 0, 1 after an error in the user's files, 130 after Ctrl-C, 143 after SIGTERM or a closed terminal.
+        Wrong arguments end the process with status 2.
     """
     own_process = argv is None
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="replace", line_buffering=True)
     if own_process and hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
-        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))  # a terminal that was closed
+        signal.signal(signal.SIGHUP, _hang_up)
     try:
         if name in OF_LIGHTNING or name.startswith("-"):
             return _run_lightning(arguments, own_process)
@@ -81,6 +81,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.name != "cv2":
             raise
         return _failed("error: OpenCV (cv2) is missing: pip install opencv-contrib-python-headless, or any other")
+
+
+def _hang_up(number: int, frame: Any) -> None:
+    """Stop, as a terminal was closed, which shell and system may both say."""
+    signal.signal(number, signal.SIG_IGN)
+    signal.raise_signal(signal.SIGTERM)
 
 
 def _end(number: int, frame: Any) -> None:
@@ -112,7 +118,7 @@ def lightning(argv: Sequence[str] | None = None) -> int:
 
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0].startswith("-") or arguments[0] in COMMANDS:
-        return main(arguments)
+        return main(argv)
     points = entry_points(group="console_scripts", name="lightning")
     others = sorted(point for point in points if not point.value.startswith("nsvq_lightning."))
     if not others:

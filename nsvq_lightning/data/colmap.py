@@ -4,11 +4,13 @@ The only place that imports pycolmap.
 """
 
 import math
+import signal
 from collections.abc import Callable, Iterable, Sequence, Sized
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise, takewhile
 from pathlib import Path, PurePath
+from threading import current_thread, main_thread
 from typing import Any, ClassVar, TypeVar
 
 import cv2  # noqa: F401  (before pycolmap, see import_pycolmap)
@@ -142,6 +144,8 @@ def import_pycolmap() -> Any:
             "pycolmap, which places cameras and undistorts photos, is not installed (it has no wheel for Linux on "
             "ARM64): build it, or undistort the photos elsewhere (colmap image_undistorter)"
         ) from error
+    if current_thread() is main_thread():  # its own handler takes the place of ours, and would leave files behind
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
     return pycolmap
 
 

@@ -345,3 +345,18 @@ def test_a_lens_with_distortion_needs_pycolmap(monkeypatch: pytest.MonkeyPatch) 
         SceneError, match=r"not installed \(it has no wheel for Linux on ARM64\): build it, or undistort"
     ):
         lens(1, "SIMPLE_RADIAL", 24, 16, params)
+
+
+HANDLED = """
+import signal
+from nsvq_lightning.data.colmap import import_pycolmap
+signal.signal(signal.SIGTERM, lambda *_: print("ours"))
+import_pycolmap()
+signal.raise_signal(signal.SIGTERM)
+"""
+
+
+def test_pycolmap_leaves_the_end_of_a_process_to_others() -> None:
+    """Its wheels come with a handler that shows a stack, so that files would stay."""
+    ran = subprocess.run([sys.executable, "-c", HANDLED], capture_output=True, text=True, check=True)
+    assert ran.stdout == "ours\n"
