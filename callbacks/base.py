@@ -1,7 +1,7 @@
 """What callbacks share: the check of the module, acting once per step, the folder of the run, the search for NaN."""
 
 from dataclasses import dataclass, field
-from functools import partial
+from inspect import get_annotations
 from pathlib import Path
 from typing import Any, ClassVar, dataclass_transform
 
@@ -19,6 +19,13 @@ from nsvq_lightning.training.run_scene import scene_of
 from .settings import check_settings
 
 
+def _with_settings(cls: type["SplatCallback"], /, **options: bool) -> None:
+    """Make a subclass a dataclass, if it has settings of its own."""
+    super(SplatCallback, cls).__init_subclass__()
+    if options or get_annotations(cls):
+        dataclass(eq=False, **options)(cls)
+
+
 @dataclass_transform(eq_default=False, field_specifiers=(field,))
 class SplatCallback(Callback):
     """Base of the callbacks that train a :class:`nsvq_lightning.SplatModule`.
@@ -28,10 +35,10 @@ class SplatCallback(Callback):
     accumulation Lightning calls the hooks that they come from for every view of the iteration. A subclass that
     overrides ``setup``, or one of these hooks beside its method, calls it here first.
 
-    Each subclass is made a dataclass, whose fields are its settings: the types of
-    :mod:`nsvq_lightning.callbacks.settings` say what they may be, the text below each is its help. What it has reached
-    are attributes without an annotation, or with ``init=False``; :attr:`state` names those that checkpoints carry. One
-    that overrides ``__post_init__`` calls it here, for the check of the settings.
+    Each subclass with annotations is made a dataclass; ``@dataclass`` above it would lose its ``field(…)``. Its fields
+    are its settings: the types of :mod:`nsvq_lightning.callbacks.settings` say what they may be, the text below each is
+    its help. What it has reached are attributes without an annotation, or with ``init=False``; :attr:`state` names
+    those that checkpoints carry. One that overrides ``__post_init__`` calls it here, for the check of the settings.
 
     A callback that acts at certain iterations has a method ``is_due(module, iteration)``, and acts where that is true:
     a subclass changes when by overriding it.
@@ -47,7 +54,7 @@ class SplatCallback(Callback):
     state: ClassVar[tuple[str, ...]] = ()
     passing: ClassVar[tuple[str, ...]] = ()
     _acted: ClassVar[dict[str, int]] = {}
-    __init_subclass__ = classmethod(partial(dataclass, eq=False))
+    __init_subclass__ = classmethod(_with_settings)
 
     def __post_init__(self) -> None:
         check_settings(self)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Annotated
+from dataclasses import fields, is_dataclass
+from typing import Annotated, Generic, TypeVar
 
 import pytest
 from jsonargparse import set_parsing_settings
@@ -16,7 +16,6 @@ from nsvq_lightning.callbacks.settings import Bound, Count, Factor, NonNegative,
 from nsvq_lightning.commands.parser import class_help
 
 
-@dataclass(eq=False)
 class Mine(SplatCallback):
     """A user's callback, whose annotations are text."""
 
@@ -30,11 +29,29 @@ class Mine(SplatCallback):
     even: Annotated[int, Bound("even", lambda value: value % 2 == 0)] = 0
 
 
-@dataclass(eq=False)
 class Derived(Mine):
     """What is inherited is checked, too; what is declared anew has its own type."""
 
     count: Whole = 0
+
+
+T = TypeVar("T")
+
+
+class Typed(SplatCallback, Generic[T]):
+    """One that has a type of its own, and makes its instances itself."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+
+
+class Narrow(Typed[int]):
+    """One without settings of its own."""
+
+
+def test_a_callback_may_be_generic_and_make_its_instances_itself() -> None:
+    assert Narrow(3).size == 3
+    assert Typed[int](4).size == 4
 
 
 @pytest.mark.parametrize("kind", [Mine, Derived])
