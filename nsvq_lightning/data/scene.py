@@ -414,8 +414,8 @@ def _image_sources(
         full, undistortion = rectify(model.cameras[number], *size, keep_maps=keep_maps)
         odd += _odd_lens(number, full, size)
         lens = _scaled(full, divisor, max_width)
-        if undistortion:
-            undistortion.scale_to(lens)
+        if undistortion and 2 * lens.width < full.width:  # what is made half as large afterwards is sharp
+            undistortion.scale_to(lens.scaled(2, 2))
         lenses[number, size] = undistortion, lens
     if odd:
         log.warning(f"{odd[0]}{f' ({len(odd) - 1} more are odd)' if odd[1:] else ''}")

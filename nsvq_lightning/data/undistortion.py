@@ -74,7 +74,7 @@ class Undistortion:
     def scale_to(self, pinhole: Pinhole) -> None:
         """Have it make pictures of a smaller pinhole camera, of images that were made smaller by as much.
 
-        Maps and pictures of large photos would take gigabytes, most of which is thrown away.
+        Maps and pictures of large photos would take gigabytes, most of which is thrown away afterwards.
         """
         scale = pinhole.width / self.pinhole.width
         width, height = (max(1, round(scale * side)) for side in self.size)
