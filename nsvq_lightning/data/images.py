@@ -122,7 +122,7 @@ def _to_srgb(profile: bytes) -> ImageCms.ImageCmsTransform | None:
         if "srgb" in name.lower():
             return None
         turn = ImageCms.buildTransform(own, ImageCms.createProfile("sRGB"), "RGB", "RGB")
-    except (OSError, ImageCms.PyCMSError):
+    except (OSError, ImportError, ImageCms.PyCMSError):  # Pillow may have been built without
         return None
     log.info(f"photos are in the colours of {name}, and are turned into those of sRGB, which viewers show")
     return turn
@@ -150,7 +150,7 @@ def _decoded(path: Path, flags: int) -> Arrays:
             # OpenCV applies the orientation to TIFFs even when told not to.
             applied = int(head.getexif().get(Base.Orientation, 1)) if head.format == "TIFF" else 1
             _check_whole(data)
-            grey = head.mode == "LA" or (head.mode == "L" and "transparency" in head.info)
+            grey = head.mode in ("LA", "PA") or (head.mode in ("L", "1") and "transparency" in head.info)
             if (head.format == "TIFF" and head.mode == "RGBA") or (grey and flags == cv2.IMREAD_UNCHANGED):
                 # OpenCV would multiply colours by alpha, or leave it out.
                 image = cv2.cvtColor(np.asarray(head.convert("RGBA")), cv2.COLOR_RGBA2BGRA)
@@ -266,7 +266,7 @@ class ImageSource:
     Attributes:
         path: Image file.
         size: Its width and height in pixels, after it was turned.
-        undistortion: Applied first; None for a pinhole camera.
+        undistortion: Applied to the photo once it has its size; None for a pinhole camera.
         pinhole: Camera of the resulting picture, which is resized to its size.
         orientation: EXIF orientation to apply; 1 leaves the pixels as stored.
         mask: Image file that says which pixels count.

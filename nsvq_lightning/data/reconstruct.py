@@ -460,7 +460,7 @@ def _converted(image: Image.Image, path: Path, kind: str) -> bytes:
     upright = ImageOps.exif_transpose(image)
     colours = upright.convert("RGBA" if upright.has_transparency_data else "RGB")
     file = BytesIO()
-    profile = upright.info.get("icc_profile") if upright.mode in ("RGB", "RGBA") else None
+    profile = upright.info.get("icc_profile") if upright.mode in ("RGB", "RGBA", "P") else None
     colours.save(file, kind, quality=JPEG_QUALITY, exif=upright.getexif(), icc_profile=profile)
     return file.getvalue()
 

@@ -168,7 +168,7 @@ class _Archive:
             shape = self._entry("means").get("shape")
             self.meta["count"] = shape[0] if isinstance(shape, list) and shape else None
         self.count = self._integer(self.meta, "count", 0, 1 << 40)
-        check_room("splats or texels", self.count, self._size)
+        check_room("splats", self.count, self._size)
         if "shN" in self.meta and "count" not in self._entry("shN"):  # its picture shows how large the palette is
             height, width = self._picture("shN", 0).shape[:2]
             bands = {_ROWS_A_LINE * sh_coefficients(degree): degree for degree in (1, 2, 3)}.get(width)
