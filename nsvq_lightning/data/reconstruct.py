@@ -26,7 +26,6 @@ from PIL.ExifTags import IFD, Base
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
 from nsvq_lightning.data.images import DAMAGED, ImageHead, read_image
 from nsvq_lightning.data.photo_files import PHOTOS, photos_below
-from nsvq_lightning.data.scene import spread
 from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
 from nsvq_lightning.top_level import log
 
@@ -76,9 +75,12 @@ class Verdict(NamedTuple):
         if self.models > 1:
             apart = f"  the photos fall apart into {self.models} scenes; sparse/0 is the largest: "
             yield f"{apart}take more photos between"
+        sharp = {name: sharpness(read_image(images / name)) for name in self.registered}
+        usual = median_high(sharp.values())
+        if blurred := [name for name in sharp if sharp[name] < 0.3 * usual]:
+            yield f"  blurred, the scene is better without: {some(blurred)}"
         if not self.missing:
             return
-        usual = median_high(sharpness(read_image(images / name)) for name in spread(self.registered, MIN_PHOTOS))
         yield "  without a place, better taken again:"
         for name, partners in itertools.islice(self.missing.items(), MAX_NAMED):
             reason = f"shares enough with {partners} other photos" if partners else "overlaps no other"
