@@ -155,7 +155,9 @@ def _found_views(path: Path, root: Path | None, origin: "Place") -> "Views":
 
     data = {}
     try:
-        data = {} if root else {**check_config(str(_run_of(path) / "config.yaml"))["data"]["init_args"]}
+        data = {**check_config(str(_run_of(path) / "config.yaml"))["data"]["init_args"]}
+        if root and Path(data["root"]).expanduser().resolve() != root.resolve():
+            data = {}
     except (KeyError, TypeError):  # a config of something else
         pass
     except ValueError as error:

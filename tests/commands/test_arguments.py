@@ -103,6 +103,13 @@ def test_a_run_says_where_its_photos_are(tmp_path: Path, demo_scene: Path) -> No
         for path in (tmp_path, tmp_path / "scene.nsvq"):
             cameras, photos = known_views(path, None)
             assert (bool(cameras), photos is not None) == (known, known)
+    # Who names the folder that the run had means its photos as they were.
+    config.write_text(f"data: {{init_args: {{root: {demo_scene}, factor: 2}}}}")
+    trained, named = (known_views(tmp_path, root)[0] for root in (None, demo_scene))
+    assert [view.size for view in named.values()] == [view.size for view in trained.values()]
+    config.write_text("data: {init_args: {root: elsewhere, factor: 2}}")
+    whole = known_views(tmp_path, demo_scene)[0]
+    assert next(iter(whole.values())).width == 2 * next(iter(trained.values())).width
     config.unlink()
     assert known_views(tmp_path, None) == ({}, None)
 
