@@ -43,7 +43,9 @@ function ticks(low, high, most) {
 /** PSNR and splats over the iterations, the phases shaded and named; every number of text is in css pixels. */
 function draw(curve, { history, phases }) {
   const width = curve.clientWidth - 24, scale = parseFloat(getComputedStyle(document.documentElement).fontSize) / 16;
-  const known = history.filter(([, psnr]) => Number.isFinite(psnr)), end = phases.at(-1)[1] || 1;
+  const known = history.filter(([, psnr]) => Number.isFinite(psnr));
+  // A run of some minutes may have gone on for longer than was planned.
+  const end = (phases.at(-1)[1] = Math.max(1, phases.at(-1)[1], history.at(-1)?.[0] ?? 0));
   const bands = phases.map(([name, to], k) => ({ name, from: k ? phases[k - 1][1] : 0, to })).filter(({ from, to }) => to > from);
   const [left, right, bottom] = [44, 48, 44].map((side) => side * scale), plot = width - left - right;
   const tight = bands.some(({ name, from, to }) => (plot * (to - from)) / end < 8 * scale * name.length);
