@@ -90,7 +90,8 @@ class SplatProgressBar(TQDMProgressBar):
                 sys.stdout = StringIO()
             return
         bar = self.train_progress_bar
-        bar.start_t = self._start + compile_seconds()
+        # Where it started after it was last shown, it would end without a new line.
+        bar.start_t = bar.last_print_t = self._start + compile_seconds()
         bar.n, bar.total = done, trainer.max_steps
         bar.set_postfix_str(text)
 

@@ -116,6 +116,8 @@ def _path(
     if kind not in ("through", "orbit") and (options.frames or options.seconds):
         raise ValueError(f"--frames and --seconds are for the paths through and orbit; {kind} has frames of its own")
     if kind not in ("through", "cameras", "orbit"):
+        if not Path(kind).is_file():
+            raise ValueError(f"--path {kind}: no such file; or name through, cameras or orbit")
         known = cameras or likely_cameras(splats, 1)  # of what the path does not say
         near, limits = min(camera.near for camera in known), known[0].slope_limits
         path, own = read_camera_path(Path(kind))
