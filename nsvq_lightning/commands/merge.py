@@ -26,7 +26,7 @@ def run(options: Namespace) -> None:
         OSError: A file cannot be read or written.
     """
     from nsvq_lightning.data.blocks import BLOCK, Block
-    from nsvq_lightning.data.scene import load_scene
+    from nsvq_lightning.data.scene import load_scene, usable
     from nsvq_lightning.io.compressed import CompressedScene, on_white, renderer
     from nsvq_lightning.io.formats import format_of, read_scene, save
     from nsvq_lightning.report.numbers import evaluate
@@ -50,7 +50,7 @@ def run(options: Namespace) -> None:
         part = whole.take(block.contains(whole.means + whole.origin)).in_use()
         say(f"{folder}: {len(part):,} of {len(whole):,} splats are in its core")
         parts.append(part)
-    photos = load_scene(blocks[0].scene, **blocks[0].options)
+    photos = usable(load_scene(blocks[0].scene, **blocks[0].options))
     # Parts have the coordinates of the whole's files, whose origin only the whole knows, or are relative to one there.
     scene = replace(CompressedScene.joined(parts).relative_to(ZERO), origin=photos.frame.origin)
     size = save(scene, options.output)

@@ -46,7 +46,7 @@ def run(options: Namespace) -> None:
     import yaml
 
     from nsvq_lightning.data.blocks import cut, write_blocks
-    from nsvq_lightning.data.scene import load_scene
+    from nsvq_lightning.data.scene import load_scene, usable
 
     if options.output.exists():
         raise FileExistsError(f"{options.output} exists: remove it, or give another folder")
@@ -54,7 +54,7 @@ def run(options: Namespace) -> None:
     if options.further:
         given = yaml.safe_load(resolve([*options.further, f"--data.root={options.scene}"]))["data"]["init_args"]
         read = {name: given[name] for name in READ if name in given}
-    scene = load_scene(options.scene, cache_bytes=0, **read)
+    scene = usable(load_scene(options.scene, cache_bytes=0, **read))
     behind = ["--model.background=white"] if scene.white else []  # what the photos of parts are in front of
     blocks = cut(scene, options.blocks, **read)
     folders = [options.output / str(number) for number in range(1, len(blocks) + 1)]

@@ -22,7 +22,7 @@ from nsvq_lightning.compression.basis import components
 from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.datamodule import SceneDataModule
-from nsvq_lightning.data.scene import Scene, check_cameras, spread
+from nsvq_lightning.data.scene import Scene, check_cameras, spread, usable
 from nsvq_lightning.io.compressed import AnySplats, CompressedScene, on_white, renderer
 from nsvq_lightning.io.morton import spatial_order
 from nsvq_lightning.io.nsvq.file import decode, encode
@@ -192,7 +192,8 @@ class Compressor:
     @cached_property
     def data(self) -> SceneDataModule:
         """The views to train on."""
-        return SceneDataModule(self.photos or viewpoints.own_scene(self._splats, self.cameras, self._render), self.seed)
+        scene = self.photos or viewpoints.own_scene(self._splats, self.cameras, self._render)
+        return SceneDataModule(usable(scene), self.seed)
 
     def best(self, splats: int, codebooks: str | None, target_bytes: int | None, max_error: float | None) -> Candidate:
         """The smallest file with an error, the best one of a size, or that with these codebooks; the first asked for.

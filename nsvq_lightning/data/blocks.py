@@ -197,7 +197,7 @@ def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path])
         front = points_in_front(points, camera)
         masks = [shown(front, inside, camera) for inside in insides]
         showing = [part for part, mask in enumerate(masks) if mask.mean() >= MIN_SHOWN]
-        if not showing:
+        if not showing or index not in (*scene.train, *scene.test):
             continue
         image, counting = scene.images[index]
         for part in showing:

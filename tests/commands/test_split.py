@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import os
 import re
 import shlex
@@ -120,6 +121,18 @@ def test_documented_lines_keep_paths_with_spaces_and_quotes(tmp_path: Path, page
     environment = os.environ | {"PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"}
     subprocess.run(["sh", "-c", shell], env=environment, check=True, timeout=60)
     assert said.read_text().splitlines() == words
+
+
+def test_a_damaged_photo_is_left_out_of_all_parts(demo_scene: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(demo_scene, scene)
+    photos = sorted((scene / "images").iterdir())
+    photos[3].write_bytes(photos[3].read_bytes()[:200])
+    assert main(["split", str(scene), str(tmp_path / "parts"), "--blocks", "2"]) == 0
+    for part in (tmp_path / "parts").iterdir():
+        frames = json.loads((part / "transforms.json").read_text())["frames"]
+        assert len(frames) > 5
+        assert "images/00003.png" not in [frame["file_path"] for frame in frames]  # named by their number
 
 
 def test_a_split_that_fails_leaves_nothing(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 from ring import cameras_around
@@ -17,7 +19,7 @@ import nsvq_lightning as nl
 from nsvq_lightning.callbacks.forecast import grown
 from nsvq_lightning.compression.compressor import SLACK, THINNEST, Compressor, Setting, setting_for
 from nsvq_lightning.compression.viewpoints import Measure, own_scene, pictures
-from nsvq_lightning.data.scene import Scene
+from nsvq_lightning.data.scene import Scene, load_scene
 from nsvq_lightning.io import CompressedScene
 from nsvq_lightning.io.nsvq.file import decode
 from nsvq_lightning.io.nsvq.header import unframe
@@ -53,6 +55,17 @@ def test_training_brings_pictures_nearer_in_other_views_too() -> None:
     few, many = (compressor(ball(600), steps, 14) for steps in (1, 60))
     setting = Setting(600, "0.5k")
     assert many.error(many.at(setting)) < 0.9 * few.error(few.at(setting))
+
+
+def test_a_photo_that_is_damaged_is_left_out(make_scene: Callable[..., Path]) -> None:
+    root = make_scene()
+    for path in (root / "images").iterdir():
+        PIL.Image.new("RGB", (40, 32)).save(path)
+    (root / "images" / "004.png").write_bytes(b"")
+    scene = load_scene(root)
+    data = Compressor(ball(60), scene.train_cameras, scene, steps=4).data
+    assert 4 in scene.train
+    assert 4 not in data.scene.train
 
 
 def test_fewer_splats_are_those_that_show(small: Compressor) -> None:
