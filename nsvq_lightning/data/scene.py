@@ -401,10 +401,7 @@ def _image_sources(
         turned = sum(head.orientation != 1 for head in heads)
         log.info(f"{turned} of {len(heads)} photos are turned by their EXIF orientation, as their cameras are")
     elif lying := sum(head_for(path, size[::-1], as_shown=True).orientation != 1 for path, size in sized):
-        log.warning(
-            f"{lying} of {len(heads)} photos are stored on their side, as are their cameras, and so the scene: nsvq "
-            "prepare turns those of another folder"
-        )
+        log.warning(f"{lying} photos are stored on their side, so the scene is: nsvq prepare turns what is elsewhere")
     if others := sum(not same_shape(head.size, size) for head, (_, size) in zip(heads, sized, strict=True)):
         log.warning(f"{others} of {len(heads)} photos {OTHER_SHAPE}")
     kinds = [(image.camera_id, head.size) for image, head in zip(model.images, heads, strict=True)]
@@ -626,7 +623,8 @@ def detailed_pixels(scene: Scene) -> float:
     """
     counts = []
     for picture in (scene.images[index] for index in spread(scene.train, _SAMPLE)):
-        least = np.clip(_CONTRAST * picture.image.numpy().std(), _ROUNDING, _DETAIL)
+        counting = picture.image[... if picture.mask is None else picture.mask].numpy()
+        least = np.clip(_CONTRAST * counting.std(), _ROUNDING, _DETAIL)
         counts.append(np.count_nonzero(np.abs(high_pass(*picture, cv2.CV_16S)) > least))
     return sum(counts) / len(counts)
 
