@@ -78,7 +78,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_root(parser, "scene folder with the photos: splats and codebooks are fitted to its train photos")
     help_ = "steps of a training; 500, or 1500 with fewer splats, if they fit into --minutes"
     add("--steps", type=positive(int), metavar="N", help=help_)
-    help_ = "what one training may take, about; %(default)g by default"
+    help_ = "what steps of one training may take, about, of a million splats if there are more; %(default)g by default"
     add("--minutes", type=positive(float), default=2.0, metavar="M", help=help_)
 
 

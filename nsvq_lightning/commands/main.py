@@ -93,6 +93,7 @@ def _end(number: int, frame: Any) -> None:
     """Have a command remove what is unfinished, and then end the process as this signal does."""
     signal.signal(number, signal.SIG_DFL)
     atexit.register(signal.raise_signal, number)
+    atexit.register(signal.signal, number, signal.SIG_DFL)  # before that: after a fit, Lightning puts this one back
     raise KeyboardInterrupt
 
 

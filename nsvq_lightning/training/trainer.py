@@ -49,10 +49,7 @@ class SplatTrainer(Trainer):
         if kwargs.get("accelerator", "auto") == "auto":
             kwargs["accelerator"] = best_device().type
         if kwargs["max_epochs"] not in (None, -1):
-            log.warning(
-                "max_epochs ends nothing: an epoch is endless here, or if limited, may end the run before its last "
-                "phases; leave it out, max_steps ends the run"
-            )
+            log.warning("max_epochs ends nothing, or with limited epochs the run too early; max_steps does")
         several = "view_parallel_notebook" if hasattr(sys, "ps1") else "view_parallel"
         if kwargs.get("strategy") == "view_parallel":
             kwargs["strategy"] = several
