@@ -94,3 +94,24 @@ def test_a_run_goes_on_where_nobody_reads_its_lines(
     for _ in range(2):
         bar.on_train_batch_end(trainer, module, None)
     assert caplog.text.count("the progress cannot be shown any more") == 1
+
+
+class Terminal(io.StringIO):
+    """What shows a bar."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_the_bar_ends_with_a_new_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sys, "stdout", terminal := Terminal())
+    monkeypatch.setattr(progress, "compile_seconds", lambda: 1e6)  # as where it all has happened only now
+    bar = SplatProgressBar(refresh_rate=1)
+    trainer = Trainer(logger=False, max_steps=9, default_root_dir=tmp_path)
+    module = SplatModule()
+    bar.setup(trainer, module, "fit")
+    bar.on_train_start(trainer, module)
+    bar.on_train_batch_end(trainer, module, None)
+    bar.train_progress_bar.refresh()
+    bar.train_progress_bar.close()
+    assert terminal.getvalue().endswith("\n")

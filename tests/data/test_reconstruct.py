@@ -424,3 +424,14 @@ def test_sharpness_does_not_depend_on_the_size() -> None:
     small = cv2.resize(large, (960, 480), interpolation=cv2.INTER_AREA)
     assert sharpness(large) == pytest.approx(sharpness(small), rel=0.1)
     assert sharpness(cv2.GaussianBlur(large, None, 12)) < 0.5 * sharpness(large)
+
+
+def test_blurred_photos_are_named_whether_they_have_a_place_or_not(tmp_path: Path) -> None:
+    sharp = _texture(96)
+    for name in ("a", "b", "c", "d"):
+        assert cv2.imwrite(str(tmp_path / f"{name}.png"), sharp if name < "c" else cv2.GaussianBlur(sharp, (0, 0), 9))
+    verdict = reconstruct.Verdict(("a.png", "b.png", "c.png"), {"d.png": 0}, 100, 0.5, 3.0, 1)
+    said = list(verdict.told(tmp_path))
+    assert "  blurred, the scene is better without: c.png" in said
+    assert "    d.png: blurred" in said
+    assert "blurred" not in " ".join(verdict._replace(registered=("a.png", "b.png"), missing={}).told(tmp_path))
