@@ -193,11 +193,12 @@ def write_blocks(scene: Scene, blocks: Sequence[Block], folders: Sequence[Path])
     insides = [block.contains(points, around=True) for block in blocks]
     # Of each part, the train and the test photos, as frames of ``transforms.json``.
     frames: list[tuple[list[Json], list[Json]]] = [([], []) for _ in blocks]
-    for index, camera in enumerate(scene.cameras):
+    for index in sorted((*scene.train, *scene.test)):
+        camera = scene.cameras[index]
         front = points_in_front(points, camera)
         masks = [shown(front, inside, camera) for inside in insides]
         showing = [part for part, mask in enumerate(masks) if mask.mean() >= MIN_SHOWN]
-        if not showing or index not in (*scene.train, *scene.test):
+        if not showing:
             continue
         image, counting = scene.images[index]
         for part in showing:

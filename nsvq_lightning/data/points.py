@@ -91,10 +91,11 @@ def random_points(cameras: list[Camera]) -> Float64s:
     count = 8 * RANDOM_POINTS
     centres, rotations = poses(cameras)
     # The cameras look at where their axes meet, or as far away as their own extent if that is farther.
-    typical = np.median(np.linalg.norm(centres - looked_at(cameras), axis=1))
+    towards = looked_at(cameras) - centres
+    typical = np.median(np.linalg.norm(towards, axis=1))
     distance = max(typical, np.linalg.norm(centres - centres.mean(0), axis=1).max(), 1e-6)
-    ahead = ((looked_at(cameras) - centres) * rotations.as_matrix()[:, :, 2]).sum(1)
-    if np.quantile(ahead, 0.8) < 0:  # in eight rooms two fifths of the cameras look away from their middle
+    # In eight rooms, two fifths of the cameras look away from their middle.
+    if np.quantile((towards * rotations.as_matrix()[:, :, 2]).sum(1), 0.8) < 0:
         distance *= OUTWARD
     chosen = torch.randint(len(cameras), (count,), generator=draws).numpy()
     across, down, away = torch.rand(3, count, generator=draws, dtype=torch.float64).numpy()
