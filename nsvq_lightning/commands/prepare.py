@@ -99,7 +99,8 @@ def run(options: Namespace) -> int:
     database = scene / reconstruct.DATABASE
     say(
         f"\n{database} ({database.stat().st_size / 1e6:.0f} MB) saves time when photos are added, and may be deleted",
-        f"next: nsvq fit --data.root {shlex.quote(scene.as_posix())}, with --minutes 5 for so long",
+        f"next: nsvq fit --data.root {shlex.quote(scene.as_posix())}",
+        "(with --minutes 5 it trains for so long)",
     )
     return 0
 

@@ -76,15 +76,15 @@ class Verdict(NamedTuple):
             apart = f"  the photos fall apart into {self.models} scenes; sparse/0 is the largest: "
             yield f"{apart}take more photos between"
         sharp = {name: sharpness(read_image(images / name)) for name in self.registered}
-        usual = median_high(sharp.values())
-        if blurred := [name for name in sharp if sharp[name] < 0.3 * usual]:
+        limit = 0.3 * median_high(sharp.values())
+        if blurred := [name for name in sharp if sharp[name] < limit]:
             yield f"  blurred, the scene is better without: {some(blurred)}"
         if not self.missing:
             return
         yield "  without a place, better taken again:"
         for name, partners in itertools.islice(self.missing.items(), MAX_NAMED):
             reason = f"shares enough with {partners} other photos" if partners else "overlaps no other"
-            if sharpness(read_image(images / name)) < 0.3 * usual:
+            if sharpness(read_image(images / name)) < limit:
                 reason = "blurred"
             yield f"    {name}: {reason}"
         if len(self.missing) > MAX_NAMED:
