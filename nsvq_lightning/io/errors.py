@@ -64,16 +64,28 @@ STRANGE = ValueError, TypeError, LookupError, AttributeError, RecursionError
 Bytes = bytes | memoryview
 
 
+@contextmanager
+def as_defect(
+    defect: str, kinds: type[Exception] | tuple[type[Exception], ...] = STRANGE, remedy: str = ""
+) -> Iterator[None]:
+    """Raise a :class:`FormatError` where the block raises one of these kinds, with the reason behind the defect."""
+    try:
+        yield
+    except FormatError:  # a ValueError, too, which has said what is wrong
+        raise
+    except kinds as error:
+        reason = repr(error) if isinstance(error, LookupError) else str(error)
+        raise FormatError(f"{defect} ({reason})", remedy) from None
+
+
 def json_object(text: bytes, name: str) -> Json:
     """The object that a file, or a part of one of this name, holds as JSON.
 
     Raises:
         FormatError: It holds something else.
     """
-    try:
+    with as_defect(f"damaged: {name} is not JSON"):
         found = json.loads(text.decode(), parse_constant=_no_number)
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"damaged: {name} is not JSON ({error})") from None
     if not isinstance(found, dict):
         raise FormatError(f"damaged: {name} is not a JSON object")
     return found

@@ -14,7 +14,7 @@ import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import STRANGE, FormatError, Json, check_room, check_start, json_object, naming_file
+from nsvq_lightning.io.errors import FormatError, Json, as_defect, check_room, check_start, json_object, naming_file
 from nsvq_lightning.io.numbers import finite_logs, logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, moved, rotated
 from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s, sh_coefficients, unit
@@ -118,22 +118,17 @@ def read_glb(path: StrPath) -> CompressedScene:
             numbers in sparse accessors or other files, compressed ones, and nodes that stretch splats unevenly are not.
             Lengths that are logarithms, and the names of drafts of the extension, are.
     """
-    with naming_file(path):
+    with naming_file(path), as_defect("of a kind that is not read, or altered", remedy="save it as a plain .glb"):
         document, data = _parsed(Path(path).read_bytes())
-        try:
-            parts, count = [], 0
-            for primitive, matrix in _primitives(document):
-                parts.append(moved(_splats(document, data, primitive), matrix))
-                count += len(parts[-1])
-                check_room("splats", count, len(data))  # primitives may share their numbers
-            if not parts:
-                used = ", ".join(map(str, document.get("extensionsUsed", ()))) or "none"
-                raise FormatError(f"no primitive has the extension {EXTENSION}; used are: {used}", "export splats so")
-            return rotated(CompressedScene.joined(parts), HALF_TURN)
-        except FormatError:
-            raise
-        except STRANGE as error:
-            raise FormatError(f"of a kind that is not read, or altered: {error!r}", "save it as a plain .glb") from None
+        parts, count = [], 0
+        for primitive, matrix in _primitives(document):
+            parts.append(moved(_splats(document, data, primitive), matrix))
+            count += len(parts[-1])
+            check_room("splats", count, len(data))  # primitives may share their numbers
+        if not parts:
+            used = ", ".join(map(str, document.get("extensionsUsed", ()))) or "none"
+            raise FormatError(f"no primitive has the extension {EXTENSION}; used are: {used}", "export splats so")
+        return rotated(CompressedScene.joined(parts), HALF_TURN)
 
 
 _MAX_JSON = 1 << 26

@@ -18,7 +18,7 @@ import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath, make_folder_of, write_bytes, write_text
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import STRANGE, FormatError, Json, naming_file
+from nsvq_lightning.io.errors import FormatError, Json, as_defect, naming_file
 from nsvq_lightning.io.sog import META, PALETTE_LIMIT, read_sog, sog_contents
 from nsvq_lightning.splats.conventions import Float64s, Integers, unit
 
@@ -161,7 +161,7 @@ def _index(path: Path) -> dict[str, list[str]]:
     with naming_file(path):
         if path.stat().st_size > _MAX_BYTES:
             raise FormatError(f"damaged: an index cannot have {path.stat().st_size} bytes")
-        try:
+        with as_defect("damaged: not the index of a streamed SOG"):
             index = json.loads(path.read_bytes())
             names, nodes = [str(PurePosixPath(name)) for name in index["filenames"]], [index["tree"]]
             finest: dict[str, None] = {}  # an ordered set: names of the files with splats of level 0
@@ -173,8 +173,6 @@ def _index(path: Path) -> dict[str, list[str]]:
             shown = list(finest)
             if around := index.get("environment"):
                 shown.append(str(PurePosixPath(around)))
-        except STRANGE as error:
-            raise FormatError(f"damaged: not the index of a streamed SOG ({error!r})") from None
         if strange := [name for name in (*names, *shown) if not _is_beside(PurePosixPath(name))]:
             raise FormatError(f"damaged: {strange[0][:80]!r} is no FOLDER/{META} or .sog beside it")
         if not finest:

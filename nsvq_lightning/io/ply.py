@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene, slices
-from nsvq_lightning.io.errors import FormatError, naming_file, wrong_start
+from nsvq_lightning.io.errors import FormatError, as_defect, naming_file, wrong_start
 from nsvq_lightning.io.numbers import FLAT, Clamped, finite_logits, finite_logs, logits_of, opacity_of
 from nsvq_lightning.io.placing import FAR
 from nsvq_lightning.splats import conventions
@@ -365,10 +365,8 @@ def _read_ascii(file: BinaryIO, header: PlyHeader) -> Float64s:
     shape = header.count, len(header.properties)
     if header.count == 0:
         return np.empty(shape)
-    try:
+    with as_defect("bad ascii data", ValueError):
         table = np.loadtxt(file, np.float64, comments=None, skiprows=header.lines, max_rows=header.count, ndmin=2)
-    except ValueError as error:
-        raise FormatError(f"bad ascii data: {error}") from None
     if table.shape != shape:
         raise FormatError(f"expected {shape[0]} lines of {shape[1]} values, got {' x '.join(map(str, table.shape))}")
     return table

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FEW_SPLATS, FormatError, Json, check_room, check_start, json_object, naming_file
+from nsvq_lightning.io.errors import FormatError, Json, as_defect, check_room, check_start, json_object, naming_file
 from nsvq_lightning.io.numbers import bytes_of, logits_of_bytes, opacity_of
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, Int64s, Integers, Uint8s, sh_coefficients
@@ -156,10 +156,8 @@ class _Archive:
     def __init__(self, data: bytes) -> None:
         self._size = len(data)
         check_start(".sog", data, _ZIP)
-        try:
+        with as_defect("truncated: no valid zip archive", _BAD_ZIP):
             self._zip = ZipFile(BytesIO(data))
-        except _BAD_ZIP as error:
-            raise FormatError(f"truncated: no valid zip archive ({error})") from None
         self.meta = json_object(self._bytes(META, 1 << 20), META)
         self.version = self.meta.get("version", 1)
         if self.version not in (1, 2):
@@ -185,11 +183,8 @@ class _Archive:
             raise FormatError(f"damaged: {name} cannot have {entry.file_size} bytes")
         if entry.compress_type not in (ZIP_STORED, ZIP_DEFLATED):  # whose length can be limited
             raise FormatError(f"{name} is compressed by method {entry.compress_type} of zip, not 0 (none) or 8")
-        try:
-            with self._zip.open(entry) as file:
-                return file.read(entry.file_size)  # not read(name), which unpacks all there is, whatever its length
-        except _BAD_ZIP as error:
-            raise FormatError(f"damaged: {name} cannot be unpacked ({error})") from None
+        with as_defect(f"damaged: {name} cannot be unpacked", _BAD_ZIP), self._zip.open(entry) as file:
+            return file.read(entry.file_size)  # not read(name), which unpacks all there is, whatever its length
 
     def _entry(self, name: str) -> Json:
         entry = self.meta.get(name)
@@ -231,16 +226,12 @@ class _Archive:
             raise FormatError(f"damaged: {META} does not name the pictures of {attribute!r}")
         name = files[number]
         # Those of splats, or of the rows of the largest palette; and twice the bytes that uncompressed ones have.
-        most = max(self._size // 2, FEW_SPLATS, 15 * PALETTE_LIMIT)
-        data = self._bytes(name, 8 * most)
-        try:
-            with Image.open(BytesIO(data), formats=("WEBP", "PNG")) as image:
-                check_room("texels", image.width * image.height, self._size, most)
-                return np.asarray(image.convert("RGBA"))
-        except FormatError:
-            raise
-        except Exception as error:  # damage can make Pillow's decoders raise anything
-            raise FormatError(f"damaged: {name} is not a picture ({error})") from None
+        most = max(self._size // 2, 15 * PALETTE_LIMIT)
+        data = BytesIO(self._bytes(name, 8 * most))
+        # Damage can make Pillow's decoders raise anything.
+        with as_defect(f"damaged: {name} is not a picture", Exception), Image.open(data, "r", ("WEBP", "PNG")) as image:
+            check_room("texels", image.width * image.height, self._size, most)
+            return np.asarray(image.convert("RGBA"))
 
     def values(self, attribute: str, texels: Uint8s) -> Float32s:
         """The values ``[N, C]`` of an attribute that texels ``[N, C]`` have the level indices of."""

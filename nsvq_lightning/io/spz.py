@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, check_room, check_start, naming_file
+from nsvq_lightning.io.errors import FormatError, as_defect, check_room, check_start, naming_file
 from nsvq_lightning.io.numbers import Clamped, bytes_of, logits_of_bytes
 from nsvq_lightning.io.placing import UP_AXES, rotated
 from nsvq_lightning.splats import conventions
@@ -183,10 +183,8 @@ def zstd_decompress(data: memoryview, size: int) -> bytes:
     """Content of a Zstandard frame that must have ``size`` bytes; no more than that is ever held in memory."""
     zstd = _zstd()
     stream = zstd.ZstdDecompressor()
-    try:
+    with as_defect("damaged: no valid Zstandard stream", zstd.ZstdError):
         content: bytes = stream.decompress(data, size + 1)
-    except zstd.ZstdError as error:
-        raise FormatError(f"damaged: no valid Zstandard stream ({error})") from None
     if len(content) != size or not stream.eof or stream.unused_data:
         raise FormatError(f"damaged: a Zstandard stream does not hold the {size} bytes that it should")
     return content
@@ -240,10 +238,8 @@ def _unzip(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
 
 def _inflate(gunzip: "zlib._Decompress", data: bytes, most: int) -> bytes:
     """At most ``most`` bytes of the stream; ``most`` must be above 0, which zlib takes as no limit."""
-    try:
+    with as_defect("damaged: no valid gzip stream", zlib.error):
         return gunzip.decompress(data, most)
-    except zlib.error as error:
-        raise FormatError(f"damaged: no valid gzip stream ({error})") from None
 
 
 def _parse(start: bytes, file_bytes: int) -> SpzHeader:

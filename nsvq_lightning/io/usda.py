@@ -10,7 +10,7 @@ import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import FormatError, check_start, naming_file
+from nsvq_lightning.io.errors import FormatError, as_defect, check_start, naming_file
 from nsvq_lightning.io.numbers import logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, UP_AXES, rotated
 from nsvq_lightning.splats.conventions import Arrays, Float32s, sh_coefficients, unit
@@ -99,7 +99,7 @@ def read_usda(path: StrPath) -> CompressedScene:
             "quats": _rows(prim, "orientations", 4),
         }
         colors = _rows(prim, _COEFFICIENTS, 3)
-        try:
+        with as_defect("truncated or damaged", ValueError):
             colors = colors.reshape(len(rows["means"]), -1)
             rows |= {"sh0": colors[:, :3], "shN": colors[:, 3:]}
             scene = CompressedScene.from_rows(rows, "bool antialiased = 1" in prim)
@@ -108,8 +108,6 @@ def read_usda(path: StrPath) -> CompressedScene:
             if found := re.search(r"\bmetersPerUnit\s*=\s*([-+.\deE]+)", about):
                 turn = turn * float(found[1])
             return rotated(scene, turn)
-        except ValueError as error:
-            raise FormatError(f"truncated or damaged: {error}") from None
 
 
 def _rows(text: str, name: str, width: int) -> Float32s:
@@ -118,8 +116,6 @@ def _rows(text: str, name: str, width: int) -> Float32s:
         value = r"(?:=|\.timeSamples\s*=\s*\{[^:\[]*:)\s*\[([^\]]*)\]"
         if found := re.search(rf"\[\]\s*{each}\s*{value}", text):
             numbers = re.sub(r"[(),]", " ", found[1]).split()
-            try:
+            with as_defect(f"damaged: {name}", ValueError):
                 return np.array(numbers, np.float32).reshape(-1, width)
-            except ValueError as error:
-                raise FormatError(f"damaged: {name} ({error})") from None
     raise FormatError(f"truncated: {name} has no end" if name in text else f"no attribute {name}")

@@ -8,7 +8,7 @@ import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.errors import Bytes, FormatError, naming_file
+from nsvq_lightning.io.errors import Bytes, FormatError, as_defect, naming_file
 from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry, frame, unframe
 from nsvq_lightning.io.nsvq.precision import LEVELS, Precision, Storage
 from nsvq_lightning.io.numbers import float_rows
@@ -184,7 +184,7 @@ def decode_paper(header: Header, streams: Mapping[str, Bytes]) -> CompressedScen
     coded = [entry for entry in header.attributes if entry.storage == "codes"]
     packed = unpack_fields(streams["codes"], n, [entry.bits for entry in coded]) if coded else []
     raw = [entry for entry in header.attributes if entry.storage == "raw" and entry.name in QUANTIZABLE]
-    try:
+    with as_defect("damaged: its parts do not fit each other", ValueError):
         return CompressedScene(
             means=float_rows(streams["means"], n, 3),
             opacities=float_rows(streams["opacities"], n, 1)[:, 0],
@@ -193,8 +193,6 @@ def decode_paper(header: Header, streams: Mapping[str, Bytes]) -> CompressedScen
             raw={entry.name: float_rows(streams[entry.name], n, entry.dim) for entry in raw},
             **header.of_scene,
         )
-    except ValueError as error:
-        raise FormatError(f"damaged: {error}") from None
 
 
 def _layout(n: int, attributes: tuple[AttributeEntry, ...]) -> tuple[StreamEntry, ...]:
