@@ -15,7 +15,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from nsvq_lightning.data.colmap import SceneError
@@ -28,12 +27,12 @@ from nsvq_lightning.io.placing import turn_up
 from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.poses import up_of
-from nsvq_lightning.splats.conventions import Bools, Float64s, Uint8s
+from nsvq_lightning.splats.conventions import Bools, Float64s, Floats, Integers, Uint8s
 
 BLOCK = "block.json"
 
 # Rows of points, and the cell of a picture that each is in.
-_Front = tuple[NDArray[np.intp], NDArray[np.intp]]
+_Front = tuple[Integers, Integers]
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class Block:
     parts: int = 0
     options: Json = field(default_factory=dict)
 
-    def contains(self, points: NDArray[np.floating[Any]], around: bool = False) -> Bools:
+    def contains(self, points: Floats, around: bool = False) -> Bools:
         """Which points ``[N, 3]`` are in its core, or in that with its surroundings.
 
         Cores have no point in common, and each point is in one.

@@ -2,14 +2,12 @@
 
 import math
 from collections import Counter
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.io.errors import Bytes
-from nsvq_lightning.splats.conventions import Float32s, Float64s, Int32s, Uint8s
+from nsvq_lightning.splats.conventions import Float32s, Float64s, Floats, Int32s, Uint8s
 from nsvq_lightning.top_level import log
 
 # Logarithm that stands for that of an axis length of 0, which discs have: too thin to show, and not beyond any format's
@@ -31,7 +29,7 @@ def finite_logits(logits: Float32s) -> Float32s:
     return np.where(np.isinf(logits), np.copysign(_OPAQUE, logits), logits)
 
 
-def logits_of(opacities: NDArray[np.floating[Any]]) -> Float32s:
+def logits_of(opacities: Floats) -> Float32s:
     """Logits of opacities of any shape: finite in [0, 1], otherwise NaN."""
     wide = opacities.astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -67,7 +65,7 @@ _ROUNDING = 1e-3
 class Clamped(Counter[str]):
     """Rounds and clamps values to a range; counts the splats outside it, by attribute."""
 
-    def nearest(self, name: str, values: NDArray[np.floating], ends: tuple[int, int]) -> Int32s:
+    def nearest(self, name: str, values: Floats, ends: tuple[int, int]) -> Int32s:
         """The nearest integers that the format has.
 
         Args:

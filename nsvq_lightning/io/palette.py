@@ -1,17 +1,15 @@
 """Few rows, or numbers, that represent many: of cells of similar ones, always the one is cut where that gains most."""
 
 from heapq import heappop, heappush
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import check_array, check_table
-from nsvq_lightning.splats.conventions import Float32s, Float64s, Int64s, Integers, Uint8s
+from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, Int64s, Integers, Uint8s
 
 
-def find_palette(rows: Float32s, weight: NDArray[np.number[Any]], count: int) -> tuple[Float32s, Int64s]:
+def find_palette(rows: Float32s, weight: Arrays, count: int) -> tuple[Float32s, Int64s]:
     """Few rows that represent many with a small weighted squared distance; the rows themselves if they are few enough.
 
     All rows start as one cell, which is cut across the direction in which they differ most, where that reduces the sum

@@ -9,7 +9,6 @@ from itertools import chain, pairwise
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene, slices
@@ -18,7 +17,7 @@ from nsvq_lightning.io.numbers import FLAT, Clamped, finite_logits, finite_logs,
 from nsvq_lightning.io.placing import FAR
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
-from nsvq_lightning.splats.conventions import SH_C0, ZERO, Arrays, Float32s, Float64s, Place, white_of
+from nsvq_lightning.splats.conventions import SH_C0, ZERO, Arrays, Float32s, Float64s, Place, Records, white_of
 from nsvq_lightning.top_level import log
 
 _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
@@ -390,7 +389,7 @@ def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, 
     return rows
 
 
-def _of_chunks(vertices: NDArray[np.void], bounds: Float32s) -> dict[str, Float64s]:
+def _of_chunks(vertices: Records, bounds: Float32s) -> dict[str, Float64s]:
     """Rows ``[N, D]`` of each attribute of packed splats, which begin with a chunk."""
     shares = {}
     for name, (lowest, largest) in _PACKED.items():
@@ -457,7 +456,7 @@ def write_compressed_ply(path: StrPath, scene: CompressedScene) -> int:
     return write_elements(path, tables, scene.antialiased)
 
 
-def _packed_part(scene: CompressedScene, clamped: Clamped) -> dict[str, NDArray[np.void]]:
+def _packed_part(scene: CompressedScene, clamped: Clamped) -> dict[str, Records]:
     """The elements of a part that begins with a chunk."""
     values = np.stack([scene.means, scene.rows("scales").clip(-20, 20), 0.5 + SH_C0 * scene.rows("sh0")], axis=1)
     starts = np.arange(0, len(scene), _CHUNK)
@@ -486,7 +485,7 @@ def _packed_part(scene: CompressedScene, clamped: Clamped) -> dict[str, NDArray[
     return {name: np.rec.fromarrays([*table.values()], names=[*table]) for name, table in tables.items()}  # type: ignore[call-overload]  # its types ask for formats, too
 
 
-def write_elements(path: StrPath, elements: Mapping[str, NDArray[np.void]], antialiased: bool = False) -> int:
+def write_elements(path: StrPath, elements: Mapping[str, Records], antialiased: bool = False) -> int:
     """Write tables as little-endian ``.ply``.
 
     Args:

@@ -31,7 +31,6 @@ from typing import Any
 from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
@@ -287,7 +286,7 @@ class _Archive:
         quats[~marked] = np.nan
         return quats
 
-    def palette(self) -> tuple[Float32s, NDArray[np.uint16]]:
+    def palette(self) -> tuple[Float32s, Integers]:
         """Palette of the spherical harmonics ``[K, D]`` and the label of each splat ``[N]``."""
         rows = self._integer(self._entry("shN"), "count", 1, PALETTE_LIMIT)
         coefficients = sh_coefficients(self.sh_degree)

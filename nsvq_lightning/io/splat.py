@@ -13,13 +13,12 @@ offset     bytes  content
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, write_bytes
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, naming_file
 from nsvq_lightning.io.numbers import Clamped, bytes_of, logits_of_bytes, logs_of_lengths
-from nsvq_lightning.splats.conventions import SH_C0, unit
+from nsvq_lightning.splats.conventions import SH_C0, Records, unit
 from nsvq_lightning.top_level import log
 
 _RECORD = np.dtype([("means", "<f4", 3), ("lengths", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
@@ -46,7 +45,7 @@ def write_splat(path: StrPath, scene: CompressedScene) -> int:
     return records.nbytes
 
 
-def _records(scene: CompressedScene, clamped: Clamped) -> NDArray[np.void]:
+def _records(scene: CompressedScene, clamped: Clamped) -> Records:
     """The splats as they are in the file."""
     records = np.empty(len(scene), _RECORD)
     records["means"] = scene.means

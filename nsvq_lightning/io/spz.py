@@ -41,7 +41,6 @@ from struct import Struct
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
@@ -50,7 +49,7 @@ from nsvq_lightning.io.numbers import Clamped, bytes_of, logits_of_bytes
 from nsvq_lightning.io.placing import UP_AXES, rotated
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import QUANTIZABLE
-from nsvq_lightning.splats.conventions import Arrays, Float32s, Uint8s, Uint32s
+from nsvq_lightning.splats.conventions import Arrays, Float32s, Floats, Uint8s, Uint32s
 from nsvq_lightning.top_level import log
 
 _MAGIC, _GZIP = b"NGSP", b"\x1f\x8b"
@@ -407,7 +406,7 @@ def read_spz(path: StrPath) -> CompressedScene:
     return rotated(scene, UP_AXES["z"]) if system > 8 else scene
 
 
-def _unpacked_means(header: SpzHeader, data: Uint8s) -> NDArray[np.floating[Any]]:
+def _unpacked_means(header: SpzHeader, data: Uint8s) -> Floats:
     if header.version == 1:
         return data.view("<f2")
     # Put three bytes at the top of four, then shift down with the sign.

@@ -16,6 +16,8 @@ Uint8s = NDArray[np.uint8]
 Uint32s = NDArray[np.uint32]
 Uint64s = NDArray[np.uint64]
 Integers = NDArray[np.integer]
+Floats = NDArray[np.floating]
+Records = NDArray[np.void]
 Arrays = NDArray[Any]
 # x, y, z in the world.
 Place: TypeAlias = tuple[float, float, float]
