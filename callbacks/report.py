@@ -1,6 +1,5 @@
 """Measure the run: curves while it trains, and the quality of the decoded file at the end."""
 
-from statistics import fmean
 from typing import Any
 
 import torch
@@ -205,8 +204,8 @@ class MetricReport(WritingCallback):
         scores = sorted(scores, key=lambda score: score["name"])
         if trainer.is_global_zero and scores:
             folder = run_folder(trainer)
-            lpips = None if self._lpips is None else fmean(score["lpips"] for score in scores), self._lpips_reason
-            metrics = numbers.summarize(folder / "scene.nsvq", self._scene, scores, lpips, module, self._paper)
+            path, reason = folder / "scene.nsvq", self._lpips_reason
+            metrics = numbers.summarize(path, self._scene, scores, reason, module, self._paper)
             with optional(folder / "metrics.json") as path:
                 numbers.write_metrics(path, metrics)
             with optional(folder / "views.csv") as path:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from csv import DictWriter
 from io import StringIO
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -66,21 +67,16 @@ def evaluate(
 
 
 def summarize(
-    path: Path,
-    scene: CompressedScene,
-    scores: Rows,
-    lpips: tuple[float | None, str | None],
-    module: SplatModule,
-    paper: Header,
+    path: Path, scene: CompressedScene, scores: Rows, lpips_reason: str | None, module: SplatModule, paper: Header
 ) -> Json:
     """The content of ``metrics.json``; sizes in bytes, PSNR in dB, times in seconds.
 
     Args:
         path: The file that was decoded.
         scene: The decoded scene.
-        scores: Row of each test view in ``views.csv``: its name, ``psnr``, ``ssim``, those of :data:`SMALLER`,
-            ``cc_psnr`` and ``cc_ssim``.
-        lpips: Mean LPIPS and None, or None and the reason.
+        scores: Row of each test view in ``views.csv``: its name, ``psnr``, ``ssim``, ``lpips``, those of
+            :data:`SMALLER`, ``cc_psnr`` and ``cc_ssim``.
+        lpips_reason: Why the rows have no ``lpips``; None where they have it.
         module: The module, for its history and schedule.
         paper: Header of the scene that was stored at level ``paper``, with the bytes of the paper's formula.
     """
@@ -91,8 +87,8 @@ def summarize(
     last = {entry["phase"]: entry for entry in module.history}  # the last evaluation of each phase
     return {
         **{name: sum(score[name] for score in scores) / len(scores) for name in scored},
-        "lpips": lpips[0],
-        "lpips_reason": lpips[1],
+        "lpips": None if lpips_reason else fmean(score["lpips"] for score in scores),
+        "lpips_reason": lpips_reason,
         "views": len(scores),
         "num_splats": len(scene),
         "file_bytes": file_bytes,

@@ -2,7 +2,7 @@
 
 import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
@@ -23,12 +23,7 @@ NAME = "report.html"
 
 
 def write_page(
-    folder: Path,
-    history: Rows,
-    schedule: Schedule,
-    seconds: Mapping[str, float],
-    metrics: Values | None = None,
-    views: Rows = (),
+    folder: Path, history: Rows, schedule: Schedule, seconds: Values, metrics: Values | None = None, views: Rows = ()
 ) -> Path:
     """Write the page of a run, atomically; without ``metrics``, browsers read it again every few seconds.
 
@@ -144,7 +139,7 @@ def _codes(metrics: Values) -> str:
     return _table(("attribute", "codebook", "in use", "entropy, bits"), rows)
 
 
-def _times(history: Rows, seconds: Mapping[str, float]) -> str:
+def _times(history: Rows, seconds: Values) -> str:
     """The table of times."""
     rows = []
     before, since = 0, 0.0
