@@ -1,6 +1,5 @@
 """What the quantize and fine-tune phases do to codebooks and codes: place, refit, replace, mend, freeze."""
 
-import math
 from collections.abc import Iterable
 from dataclasses import field
 from typing import Any
@@ -82,7 +81,7 @@ class CodebookInit(SplatCallback):
 
     def tell(self, module: SplatModule) -> None:
         """Tell how large codebooks may be."""
-        module.values_per_splat = self.values_per_splat or math.inf
+        module.values_per_splat = self.values_per_splat or torch.inf
 
     def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Look for the train views now, not after most of the training.

@@ -8,7 +8,6 @@ takes 16 bits or more of a splat, and a whole splat 5 bytes or more in every for
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from os import fspath
 from typing import Any
 
 from nsvq_lightning.io.atomic import StrPath
@@ -39,7 +38,7 @@ def naming_file(path: StrPath) -> Iterator[None]:
     try:
         yield
     except FormatError as error:
-        raise FormatError(f"{fspath(path)}: {error.defect}", error.remedy) from None
+        raise FormatError(f"{path}: {error.defect}", error.remedy) from None
 
 
 def wrong_start(suffix: str, data: bytes, magic: bytes) -> FormatError:
