@@ -266,8 +266,7 @@ class Compressor:
 
     def _fitting(self, setting: Setting, target: int) -> Candidate | None:
         """The candidate nearest to the most exact one of at most ``target`` bytes."""
-        close = (1 - SLACK) * target
-        return self._between(setting, lambda each: len(each.data) <= target, lambda size: size >= close)
+        return self._between(setting, lambda each: len(each.data) <= target, (1 - SLACK) * target)
 
     def _finest_coded(self, target: int, splats: int, needed: bool) -> Candidate | None:
         """The best file with codebooks of at most ``target`` bytes; too few are refused only where it is needed."""
@@ -328,13 +327,12 @@ class Compressor:
         return min(found, key=lambda each: len(each.data))
 
     def _between(
-        self,
-        setting: Setting,
-        fits: Callable[[Candidate], bool],
-        is_close: Callable[[int], bool] = lambda _: False,
-        small: bool = True,
+        self, setting: Setting, fits: Callable[[Candidate], bool], close: float = math.inf, small: bool = True
     ) -> Candidate | None:
-        """The candidate nearest to the most exact one, or with ``small`` False to the smallest, that fits; or None."""
+        """The candidate nearest to the most exact one, or with ``small`` False to the smallest, that fits; or None.
+
+        One of ``close`` bytes is near enough.
+        """
         good, bad = (1.0, 0.0) if small else (0.0, 1.0)
         best = self.at(setting._replace(turn=bad))
         if fits(best):
@@ -342,7 +340,7 @@ class Compressor:
         best = self.at(setting._replace(turn=good))
         if not fits(best):
             return None
-        while abs(good - bad) > 0.02 and not is_close(len(best.data)):
+        while abs(good - bad) > 0.02 and len(best.data) < close:
             middle = (good + bad) / 2
             candidate = self.at(setting._replace(turn=middle))
             if fits(candidate):
