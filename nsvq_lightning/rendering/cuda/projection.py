@@ -221,20 +221,15 @@ def _check_attributes(lens: Lens, attributes: tuple[Tensor, ...], sampling: View
 
 
 def _launch_projection(
-    lens: Lens,
-    attributes: tuple[Tensor, ...],
-    degree: int,
-    sampling: ViewSampling | None,
-    records: Tensor,
-    boxes: Tensor,
-    means2d: Tensor,
+    lens: Lens, attributes: tuple[Tensor, ...], degree: int, sampling: ViewSampling | None, *outputs: Tensor
 ) -> Tensor:
+    """Write records, boxes and projected centres of all splats, and return their radii."""
     n, shN = len(attributes[0]), attributes[-1]
     _check_attributes(lens, attributes, sampling)
     radii = shN.new_zeros(n, dtype=torch.int32)
     if n:
         project_kernel[(triton.cdiv(n, BLOCK),)](
-            *attributes, *lens, n, 3 * shN.shape[1], *(sampling or NO_SAMPLING), records, boxes, means2d, radii,
+            *attributes, *lens, n, 3 * shN.shape[1], *(sampling or NO_SAMPLING), *outputs, radii,
             DEGREE=degree, BLOCK=BLOCK, **COMPILE,
         )  # fmt: skip
     return radii
