@@ -13,16 +13,12 @@ import json
 import shlex
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import positive
 from nsvq_lightning.io.atomic import write_text
-
-if TYPE_CHECKING:
-    from nsvq_lightning.data.reconstruct import Report
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -73,12 +69,15 @@ def run(options: Namespace) -> int:
             bars[step].close()
 
     remarks = []
-    if is_video:
-        names = _frames(options, images, report)
-    else:
+    if not is_video:
         names, closed = reconstruct.copy_photos(photos, source, source if in_place else images, report)
         for reason, files in (left_out | closed).items():
             remarks.append(f"left out: {reconstruct.some(files)}: {reason}")
+    elif (scene / reconstruct.DATABASE).exists():  # frames were complete before features were looked for
+        names = [name for name in reconstruct.stamps_in(scene) if (images / name).exists()]
+    else:
+        names = reconstruct.write_frames(source, images, options.frames, report)
+        say(f"{len(names)} sharp frames")
     if len(names) < 2:
         raise ValueError("; ".join([f"{source}: {len(names)} pictures are too few, a scene takes 50 to 300", *remarks]))
     if find_model(source):
@@ -103,18 +102,6 @@ def run(options: Namespace) -> int:
         "(with --minutes 5 it trains for so long)",
     )
     return 0
-
-
-def _frames(options: Namespace, images: Path, report: "Report") -> list[str]:
-    """The names of the frames of a video, which are chosen unless that was done."""
-    from nsvq_lightning.data import reconstruct
-
-    # They were complete before features were looked for.
-    if (options.scene / reconstruct.DATABASE).exists():
-        return [name for name in reconstruct.stamps_in(options.scene) if (images / name).exists()]
-    names = reconstruct.write_frames(options.source, images, options.frames, report)
-    say(f"{len(names)} sharp frames")
-    return names
 
 
 def _claim(options: Namespace, is_video: bool, in_place: bool) -> None:
