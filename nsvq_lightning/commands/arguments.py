@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from nsvq_lightning.data.scene import Scene
     from nsvq_lightning.io.compressed import CompressedScene
     from nsvq_lightning.rendering.camera import Camera
-    from nsvq_lightning.splats.conventions import Place
 
     # Cameras by the names of their photos, and these.
     Views = tuple[dict[str, Camera], Scene | None]
@@ -141,7 +140,7 @@ def folders_beside(path: Path) -> list[Path]:
 READ = "factor", "max_width", "test_every", "images_folder", "model", "masks", "allow_outside"
 
 
-def _found_views(path: Path, root: Path | None, origin: "Place") -> "Views":
+def _found_views(path: Path, root: Path | None, origin: tuple[float, ...]) -> "Views":
     """Cameras by name of the photos that a scene was trained on, and these photos, if a folder of them is named.
 
     That is ``root``, or the one in the settings of the scene's run; photos of a run are those that it has trained on,
