@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -140,7 +139,7 @@ class LiveScene(WritingCallback):
                 state["psnr"] = f"{module.history[-1]['psnr']:.2f}"
             config = {"antialiased": module.antialiased, "background": module.background, "live": state}
             scene = CompressedScene.from_splats(splats, config=config)
-            scene = replace(placed(scene, module.frame), cameras=module.cameras)
+            scene = placed(scene, module.frame, cameras=module.cameras)
             with optional(folder / viewer.LIVE_SCENE) as path:
                 save(scene, path, "paper")
         self._answered, ended = asked, time.monotonic()

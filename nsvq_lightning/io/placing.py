@@ -1,6 +1,6 @@
 """Scenes turned, scaled, moved and cropped, by the rows of their codebooks."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -88,11 +88,11 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     )
 
 
-def placed(scene: CompressedScene, frame: "Frame") -> CompressedScene:
-    """The scene in the coordinates of its files, from those of the frame that it was trained in."""
+def placed(scene: CompressedScene, frame: "Frame", **fields: Any) -> CompressedScene:
+    """The scene in the coordinates of its files, from those of the frame that it was trained in, with these fields."""
     means = frame.unit * scene.means.astype(np.float64) + frame.middle
     scales = {"scales": lambda rows: rows + np.log(frame.unit)}
-    return scene.changed(scales, means=means.astype(np.float32), origin=frame.origin)
+    return scene.changed(scales, means=means.astype(np.float32), origin=frame.origin, **fields)
 
 
 def cropped(scene: CompressedScene, low: Float64s, high: Float64s) -> CompressedScene:

@@ -1,7 +1,7 @@
 """What a run has made of its scene so far: splats and codebooks, how they are rendered, and how they are stored."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -103,7 +103,7 @@ class SplatScene:
         }
         if self.antialiased:
             told["antialiased"] = True
-        return replace(placed(replace(scene, config=told), self.frame), cameras=self.cameras)
+        return placed(scene, self.frame, config=told, cameras=self.cameras)
 
 
 @torch.no_grad()
