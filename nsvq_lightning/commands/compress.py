@@ -26,7 +26,6 @@ from nsvq_lightning.splats.attributes import DEFAULT_SIZE, SIZES
 
 if TYPE_CHECKING:
     from nsvq_lightning.compression.compressor import Compressor
-    from nsvq_lightning.compression.viewpoints import Measure
 
 LOD_LEVELS = 3
 
@@ -51,13 +50,6 @@ def splats_left(asked: int | float | None, count: int) -> int:
     if asked is None:
         return count
     return min(count, max(1, asked if isinstance(asked, int) else round(asked * count)))
-
-
-def written_error(measure: "Measure", error: float, original: str) -> str:
-    """An error in words, with what it is to be compared with."""
-    from nsvq_lightning.compression.viewpoints import decibels
-
-    return f"error {error:.4g} ({decibels(error):.2f} dB against {original} in {len(measure.cameras)} pictures)"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -139,7 +131,7 @@ def _write_file(options: Namespace, compressor: "Compressor", most: int, views: 
     before, after = compressor.scene.stored_bytes or 0, len(candidate.data)
     sizes = candidate.setting.codebooks
     books = "no codebooks" if sizes == "none" else f"codebooks {sizes}"
-    error = written_error(compressor.measure, compressor.error(candidate), "the original")
+    error = compressor.measure.told(compressor.error(candidate), "the original")
     say(
         f"{options.output}: {len(candidate.scene):,} of {len(compressor.scene):,} splats in {after:,} bytes, "
         f"{before / after:.1f} times smaller than {options.input.name}",

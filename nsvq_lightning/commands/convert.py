@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import add_root, known_views, trained_scene, views_of
-from nsvq_lightning.commands.compress import share_or_number, splats_left, written_error
+from nsvq_lightning.commands.compress import share_or_number, splats_left
 from nsvq_lightning.io import formats, lod, placing, spz
 from nsvq_lightning.io.compressed import CompressedScene, on_white, renderer
 from nsvq_lightning.io.nsvq.precision import LEVELS
@@ -197,4 +197,4 @@ def _measure(source: Path, output: Path, root: Path | None) -> None:
     written = formats.read_scene(output)
     if formats.suffix_of(output) == ".glb":  # which may have its origin in its positions
         written = written.relative_to(original.origin)
-    say(f"  {written_error(measure, measure.error(written.tensors()), source.name)}")
+    say(f"  {measure.told(measure.error(written.tensors()), source.name)}")

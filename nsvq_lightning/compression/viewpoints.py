@@ -85,6 +85,10 @@ class Measure:
         squares = [float((a - b).double().square().mean()) for a, b in zip(found, self._expected, strict=True)]
         return math.sqrt(np.mean(squares))
 
+    def told(self, error: float, original: str) -> str:
+        """An error in words, with what it is measured against."""
+        return f"error {error:.4g} ({decibels(error):.2f} dB against {original} in {len(self.cameras)} pictures)"
+
 
 # Views of a scene that has no photos.
 VIEWS = 96
