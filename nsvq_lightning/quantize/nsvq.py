@@ -1,6 +1,7 @@
 """Noise substitution in vector quantization (NSVQ, Vali and Bäckström 2022), and its relative DiVeQ."""
 
 import math
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -9,7 +10,6 @@ from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.rows import put_rows
-from nsvq_lightning.quantize import substitution
 from nsvq_lightning.quantize.codebook import CodebookQuantizer
 from nsvq_lightning.quantize.kmeans import sum_by_code
 
@@ -93,11 +93,8 @@ class _Substitution(torch.autograd.Function):
 def _kernels(like: Tensor) -> Any:
     """The module whose kernels take a tensor, or None."""
     kernels = kernels_for(like)
-    if kernels == "cuda":
-        from nsvq_lightning.quantize.cuda import substitution as on_device
-
-        return on_device
-    return substitution if kernels == "cpu" else None
+    homes = {"cpu": "substitution", "cuda": "cuda.substitution"}
+    return import_module(f"{__package__}.{homes[kernels]}") if kernels else None
 
 
 def _directions(residual: Tensor, seed: int, aim: float, spread: float) -> Tensor:
