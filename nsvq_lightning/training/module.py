@@ -175,16 +175,8 @@ class SplatModule(LightningModule):
     @property
     def scene(self) -> SplatScene:
         """What is trained, as it is now: renders any splats, and gives the rows that codebooks are placed on."""
-        return SplatScene(
-            splats=self.splats,
-            quantizers=self.quantizers,
-            frame=self.frame,
-            sh_degree=self.active_sh_degree,
-            background=self.background,
-            antialiased=self.antialiased,
-            backend=self.backend,
-            cameras=self.cameras,
-        )
+        how = self.active_sh_degree, self.background, self.antialiased, self.backend
+        return SplatScene(self.splats, self.quantizers, self.frame, *how, self.cameras)
 
     def compressed(self) -> CompressedScene:
         """The scene as it is stored, in the coordinates of its files (:meth:`SplatScene.compressed`).
