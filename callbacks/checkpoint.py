@@ -4,7 +4,6 @@ import signal
 from contextlib import nullcontext
 from pathlib import Path
 from threading import current_thread, main_thread
-from types import FrameType
 from typing import Any
 
 import torch
@@ -82,7 +81,7 @@ class GracefulStop:
                 signal.signal(number, handler)
         self._handlers, self._pending = {}, []
 
-    def _receive(self, number: int, frame: FrameType | None) -> None:
+    def _receive(self, number: int, frame: Any) -> None:
         if number not in self._pending:
             self._pending.append(number)
             more = "" if self._several else "; a second one stops at once, without a checkpoint"

@@ -5,8 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
 from nsvq_lightning.io import glb, lod, ply, sog, splat, spz, usda
 from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.io.compressed import AnySplats, CompressedScene
@@ -61,7 +59,7 @@ def read_scene(path: StrPath) -> CompressedScene:
     scene = format_of(path).read(path)
     with naming_file(path):
         kept = scene.finite()
-    if unturned := len(kept) - np.count_nonzero(kept.rows("quats").any(axis=1)):
+    if unturned := len(kept) - kept.rows("quats").any(axis=1).sum():
         log.warning(f"{path}: {unturned} of {len(kept)} splats have the rotation 0 0 0 0: not turned")
     return replace(kept, stored_bytes=scene.stored_bytes or path.stat().st_size)
 

@@ -1,7 +1,6 @@
 """The Lightning module: one step of training; what happens at certain steps is left to callbacks."""
 
 import math
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
@@ -385,7 +384,7 @@ class SplatModule(LightningModule):
         Raises:
             FormatError: The checkpoint is damaged, or its settings name something that has not been imported.
         """
-        checkpoint = resume.PlainCheckpointIO().load_checkpoint(os.fspath(checkpoint_path))
+        checkpoint = resume.PlainCheckpointIO().load_checkpoint(checkpoint_path)
         stored = checkpoint.get(cls.CHECKPOINT_HYPER_PARAMS_KEY, {})
         resume.check_settings(checkpoint_path, {k: v for k, v in stored.items() if k not in settings})
         return super().load_from_checkpoint(checkpoint_path, *args, **settings)

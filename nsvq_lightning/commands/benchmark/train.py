@@ -15,7 +15,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from warnings import catch_warnings
 
-import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from nsvq_lightning.commands.benchmark import timing
@@ -192,7 +191,6 @@ def run(scope: Scope) -> Iterator[Measurement]:
         yield Measurement("run", described, name, samples, clock.products, values)
 
 
-@torch.no_grad()
 def _test_psnr(module: SplatModule) -> float:
     data: ColmapDataModule = module.trainer.datamodule  # type: ignore[attr-defined]  # Lightning does not type it
     return evaluate(module.scene.render, module.scene.hard_splats(module.phase), data.test_dataloader())[0]

@@ -8,7 +8,6 @@ add storage kinds of attributes, stream names and stream encodings; the frame st
 
 import json
 import math
-import os
 import struct
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -290,7 +289,7 @@ def read_header(path: StrPath) -> Header:
 def describe_nsvq(path: StrPath) -> Json:
     """Facts about a file, as JSON values; errors are those of :func:`read_header`."""
     header = read_header(path)
-    total = os.path.getsize(path)
+    total = Path(path).stat().st_size
     start = StreamEntry("header", total - sum(stream.length for stream in header.streams), "json")
     return {
         "format": f"nsvq, level {header.level}",
