@@ -45,8 +45,8 @@ def run(options: Namespace) -> int:
     """
     from nsvq_lightning.commands.doctor import check_folder, shown
     from nsvq_lightning.data import reconstruct
-    from nsvq_lightning.data.colmap import find_model
     from nsvq_lightning.data.images import ON_ITS_SIDE, image_head
+    from nsvq_lightning.data.transforms import has_poses
 
     source, scene = options.source, options.scene
     if not source.exists():
@@ -80,7 +80,7 @@ def run(options: Namespace) -> int:
         say(f"{len(names)} sharp frames")
     if len(names) < 2:
         raise ValueError("; ".join([f"{source}: {len(names)} pictures are too few, a scene takes 50 to 300", *remarks]))
-    if find_model(source):
+    if has_poses(source):
         remarks.append(f"{source} has cameras already: nsvq fit --data.root {shlex.quote(source.as_posix())} uses them")
     heads = {name: image_head(images / name) for name in names}
     if in_place and max(head.orientation for head in heads.values()) >= ON_ITS_SIDE:

@@ -25,8 +25,9 @@ from nsvq_lightning.top_level import log
 
 # Upper bound on poses and intrinsics: their squares, which rendering computes in float32, stay finite.
 MAX_NUMBER = 1e18
-# Where a model may be inside a scene folder, in order of preference.
-FOLDERS = ("sparse/0", "sparse", ".")
+# Where a model may be inside a scene folder, in order of preference: COLMAP's image_undistorter writes its own into
+# sparse, beside that of the photos as they were in sparse/0.
+FOLDERS = ("sparse", "sparse/0", ".")
 # The tables of a COLMAP model; a scene can do without the last one.
 TABLES = ("cameras", "images", "points3D")
 
@@ -402,12 +403,13 @@ def _no_model(root: Path, folders: Sequence[str], chosen: str | None) -> SceneEr
     """What to say of a folder without a model."""
     found = [path for folder in folders for path in (root / folder).glob("*.*") if path.stem in TABLES]
     where = root
-    advice = "nor is there a transforms.json: make a scene with nsvq prepare, or copy the missing files"
+    advice = "nor is there a transforms.json: copy what is missing, export cameras as COLMAP's, or use nsvq prepare"
     if chosen is not None:
         where = root / folders[0]
         advice = f"choose another (--data.model); there is {', '.join(other_models(root)) or 'none in the folder'}"
+    places = ", ".join(sorted(folders)[::-1])  # the usual one first
     return SceneError(
-        f"no COLMAP model in {where}: looked for cameras and images (.bin or .txt) in {', '.join(folders)}; "
+        f"no COLMAP model in {where}: looked for cameras and images (.bin or .txt) in {places}; "
         f"there is {' and '.join(str(path.relative_to(root)) for path in found) or 'neither'}; {advice}"
     )
 

@@ -343,10 +343,11 @@ RAW = (".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 # Names of folders that hold something else than photos, or the same photos again, and of files that are such.
 OTHER = re.compile(
-    r"\..*|__MACOSX|(.*_)?(masks?|depths?|normals?)|confidence|corrected_images|\.?thumb.*|images_\d+|[248]x|sparse|runs",
+    r"\..*|__MACOSX|(.*_)?(masks?|depths?|normals?|semantics)|conf(idence)?|depth_?maps|(un)?distorted|dense|"
+    r"corrected_images|\.?thumb.*|images_\d+|[248]x|sparse|runs",
     re.IGNORECASE,
 )
-OTHER_FILES = re.compile(r"thumbnail|(thumb|conf|depth|mask)_\d+|.*\d_(mask|depth|normal)", re.IGNORECASE)
+OTHER_FILES = re.compile(r"thumbnail|(thumb|conf|depth|mask)_\d+|.*\d_(mask|depth|normal)(_\d+)?", re.IGNORECASE)
 
 
 def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:

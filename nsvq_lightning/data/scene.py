@@ -379,8 +379,8 @@ def _in_front_of_white(images: ImageStore) -> bool:
 
 
 OTHER_SHAPE = (
-    "have another aspect ratio than their camera: they were cropped, rotated or mixed up after COLMAP ran; copy the "
-    "photos it ran on"
+    "have another aspect ratio than their camera: they were cropped, rotated, undistorted or mixed up after COLMAP "
+    "ran; copy the photos it ran on, or the model of these"
 )
 
 

@@ -69,10 +69,9 @@ def has_poses(root: Path) -> bool:
 
 def _files_in(root: Path) -> list[Path]:
     """The transforms file of a folder, or that of the train views and the one of the test views; maybe none."""
-    single, train, test, val = (root / f"transforms{part}.json" for part in ("", "_train", "_test", "_val"))
-    if single.is_file():
-        return [single]
-    return [path for path in (train, test, val) if path.is_file()][:2] if train.is_file() else []
+    single, *parts = (root / f"transforms{part}.json" for part in ("", "_train", "_test", "_val"))
+    found = [path for path in parts if path.is_file()][:2] if parts[0].is_file() else []
+    return [single] if single.is_file() and len(found) < 2 else found
 
 
 def _with_colmap_points(poses: ColmapModel, root: Path) -> ColmapModel:

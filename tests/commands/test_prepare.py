@@ -106,6 +106,16 @@ def test_photos_of_nothing_in_common_are_told(photos: Path, tmp_path: Path, caps
     assert "Photos with a partner: 0 of 3" in said
 
 
+def test_folders_with_cameras_are_told_from_photos(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed in range(2):
+        _noise(photos / f"{seed}.png", seed)
+    (photos / "transforms.json").write_text("{}")
+    assert main(["prepare", str(photos), str(tmp_path / "scene")]) == 1
+    assert f"{photos} has cameras already: nsvq fit --data.root {photos} uses them" in "".join(capsys.readouterr())
+
+
 def test_photos_that_cannot_be_read_are_told(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("a.HEIC", "b.nef", "c.jxl"):
         (photos / name).write_bytes(b"x")

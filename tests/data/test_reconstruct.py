@@ -304,6 +304,11 @@ def test_what_apps_export_beside_photos_is_left_out(tmp_path: Path) -> None:
     assert list(left) == ["no photos by their names, or that of their folder"]
     _touch(tmp_path / "nerfies", "rgb/1x/1.png", "rgb/2x/1.png", "rgb/4x/1.png")
     assert _names_in(tmp_path / "nerfies")[0] == ["rgb/1x/1.png"]
+    _touch(tmp_path / "lego", "train/r_0.png", "test/r_0.png", "test/r_0_depth_0001.png", "test/r_0_normal_0001.png")
+    assert _names_in(tmp_path / "lego")[0] == ["test/r_0.png", "train/r_0.png"]
+    others = ("dense/0/images/1.jpg", "undistorted/images/1.jpg", "depth_maps/1.png", "semantics/1.png", "conf/1.png")
+    _touch(tmp_path / "odm", "images/1.jpg", *others)
+    assert _names_in(tmp_path / "odm")[0] == ["images/1.jpg"]
 
 
 def test_copies_in_folders_keep_their_names(folders: tuple[Path, Path]) -> None:

@@ -143,6 +143,26 @@ def test_photos_of_another_shape_than_their_camera_are_warned_of(
     assert re.match(r"1 of \d+ photos have another aspect ratio than their camera: they were cropped, rotated", message)
 
 
+def test_photos_whose_distortion_was_taken_out_in_their_place_are_warned_of(
+    make_scene: SceneFactory, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = make_scene()
+    for path in (root / "images").iterdir():
+        picture = cv2.imread(str(path))
+        height, width = (round(0.92 * side) for side in picture.shape[:2])
+        assert cv2.imwrite(str(path), picture[2 : 2 + height, 3 : 3 + width])
+    load_scene(root)
+    assert "photos have another aspect ratio than their camera: they were cropped, rotated, undistorted" in caplog.text
+
+
+def test_a_model_in_sparse_itself_is_the_later_one(make_scene: SceneFactory) -> None:
+    root = make_scene(views=9)
+    for path in (make_scene("undistorted", views=5) / "sparse/0").iterdir():
+        shutil.copy(path, root / "sparse")
+    assert len(load_scene(root)) == 5
+    assert len(load_scene(root, model="0")) == 9
+
+
 def test_a_larger_model_beside_the_first_is_named(make_scene: SceneFactory, caplog: pytest.LogCaptureFixture) -> None:
     root = make_scene(views=9)
     shutil.copytree(make_scene("more", views=10) / "sparse/0", root / "sparse/1")
@@ -705,6 +725,8 @@ def test_a_folder_of_masks_that_is_asked_for_counts_before_those_named(demo_scen
     (root / "transforms.json").write_text(json.dumps(document))
     for masks, rows in (("masks", 10), ("asked", 20)):
         assert int((~load_scene(root, masks=masks).view(1).mask).sum()) == rows * 96
+    shutil.rmtree(root / "named")
+    assert int((~load_scene(root, masks="asked").view(1).mask).sum()) == 20 * 96
 
 
 def test_folders_that_are_links_are_searched(demo_scene: Path, tmp_path: Path) -> None:

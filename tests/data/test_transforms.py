@@ -174,6 +174,9 @@ def test_blender_scenes_have_their_own_split_and_random_points(
     assert scene.cameras[0].intrinsics == pytest.approx((0.78 * 96, 0.78 * 96, 36, 36))
     assert len(scene.points) == FEW
     assert torch.equal(scene.points, load_scene(root).points)
+    shutil.copy(root / "transforms_train.json", root / "transforms.json")  # of all frames, as some exporters have it
+    assert load_scene(root).names == scene.names
+    (root / "transforms.json").unlink()
     (root / "transforms_test.json").rename(root / "transforms_val.json")
     assert len(load_scene(root).test) == 3
     unrendered = shutil.copytree(root, tmp_path / "unrendered")
