@@ -150,7 +150,7 @@ class _Handler(BaseHTTPRequestHandler):
     followed = False
 
     def do_GET(self) -> None:
-        path = urlsplit(self.path).path  # messengers add a query to a link
+        path = self.path.partition("?")[0]  # messengers add a query to a link
         if not _is_own(self.headers.get("Host", ""), self.host):
             self._answer(403, b"open the address that nsvq view has printed")
         elif path == "/":

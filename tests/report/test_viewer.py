@@ -281,6 +281,26 @@ def test_address_names_a_camera_and_tools_move_it(tab: Page, page: Path, scene_f
 
 
 @needs_chromium
+def test_keys_move_however_short_they_are_pressed(tab: Page, page: Path) -> None:
+    _shown(tab, page.as_uri(), 97, 64)
+    before = np.array(tab.run("nsvqViewer.camera()")["camera_to_world"])
+    # both before the next picture
+    tab.run("for (const type of ['keydown', 'keyup']) dispatchEvent(new KeyboardEvent(type, { key: 'd' })); true")
+    moved = np.array(tab.run("nsvqViewer.camera()")["camera_to_world"]) - before
+    assert np.abs(moved).max() > 1e-3
+
+
+@needs_chromium
+def test_the_list_of_cameras_keeps_the_keyboard(tab: Page, page: Path) -> None:
+    _shown(tab, page.as_uri(), 97, 64)
+    choose = "cameras.selectedIndex = {}; cameras.dispatchEvent(new Event('change')); document.activeElement.id"
+    tab.run("globalThis.cameras = document.getElementById('cameras'); cameras.focus(); true")
+    assert [tab.run(choose.format(index)) for index in (1, 2)] == ["cameras", "cameras"]
+    tab.run("cameras.dispatchEvent(new Event('pointerdown')); true")
+    assert tab.run(choose.format(0)) == "canvas"
+
+
+@needs_chromium
 def test_keyframes_become_a_camera_path(tab: Page, page: Path) -> None:
     _shown(tab, page.as_uri(), 97, 64)
     poses = []

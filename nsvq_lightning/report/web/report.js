@@ -42,7 +42,7 @@ function ticks(low, high, most) {
 
 /** PSNR and splats over the iterations, the phases shaded and named; every number of text is in css pixels. */
 function draw(curve, { history, phases }) {
-  const width = curve.clientWidth - 24, scale = parseFloat(getComputedStyle(document.documentElement).fontSize) / 16;
+  const scale = parseFloat(getComputedStyle(document.documentElement).fontSize) / 16, width = curve.clientWidth - 24 * scale;
   const known = history.filter(([, psnr]) => Number.isFinite(psnr));
   // A run of some minutes may have gone on for longer than was planned.
   const end = (phases.at(-1)[1] = Math.max(1, phases.at(-1)[1], history.at(-1)?.[0] ?? 0));

@@ -647,7 +647,7 @@ async function main() {
   const backgrounds = [own, [0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5]];
   const keys = new Set(), keyframes = [], waiting = [];
   let background = 0, current = scene.start, scheduled = false, sorting = false, sorted = null, last = 0, touched = 0, share = 1;
-  let portion = 1, sortedPortion = 1, swaying, swayed = 0;
+  let portion = 1, sortedPortion = 1, swaying, swayed = 0, ratio = 0;
 
   // ---- frames, only when something changed
 
@@ -668,6 +668,7 @@ async function main() {
 
   function frame(now) {
     scheduled = false;
+    if (devicePixelRatio !== ratio) resize(); // on another monitor
     const elapsed = last && now - last;
     if (keys.size) fly(Math.min(elapsed, 200) / 1000);
     if (swaying) sway(Math.min(elapsed, 200) / 1000);
@@ -724,8 +725,9 @@ async function main() {
 
   function resize() {
     const coarse = matchMedia("(pointer: coarse)").matches;
-    const ratio = Math.min(devicePixelRatio || 1, coarse ? 1.5 : 2);
-    const sides = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.max(1, Math.round(side * ratio)));
+    ratio = devicePixelRatio;
+    const finest = Math.min(ratio || 1, coarse ? 1.5 : 2);
+    const sides = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.max(1, Math.round(side * finest)));
     if (sides[0] === canvas.width && sides[1] === canvas.height) return;
     [canvas.width, canvas.height] = sides; // this also clears it
     schedule();
@@ -859,6 +861,7 @@ async function main() {
     const name = event.key.toLowerCase();
     if (name in flight) {
       keys.add(name);
+      if (!event.repeat) fly(1 / 20); // a slow device may draw nothing before the key is released
       moved();
     } else if (event.repeat) return;
     else if (event.key in commands) actions[commands[event.key]]();
@@ -907,9 +910,12 @@ async function main() {
 
   canvas.addEventListener("webglcontextlost", () => say("The graphics device was taken away; reload the page."));
   element("cameras").replaceChildren(...scene.cameras.map(({ name }, index) => new Option(name, index)));
+  let pointed = false; // the arrow keys choose, too, and go on choosing
+  element("cameras").addEventListener("pointerdown", () => (pointed = true));
   element("cameras").addEventListener("change", (event) => {
     show(Number(event.target.value));
-    canvas.focus();
+    if (pointed) canvas.focus();
+    pointed = false;
   });
   addEventListener("hashchange", () => say(follow()));
   canvas.addEventListener("pointerdown", () => say(""));
