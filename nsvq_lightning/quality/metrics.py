@@ -17,7 +17,7 @@ def color_corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) ->
 
     This is the usual correction before metrics where photos differ in exposure (Mildenhall et al. 2022; NerfBaselines
     and gsplat report it as ``cc_psnr``): each channel becomes a polynomial of degree two in all three, by least squares
-    over the pixels that are not clipped, five times over, each time clamped to [0, 1].
+    over the pixels that neither picture clips, nor its last estimate, five times over, each time clamped to [0, 1].
 
     Args:
         image: ``[H, W, 3]`` in [0, 1].
@@ -31,7 +31,7 @@ def color_corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) ->
     target = photo.reshape(-1, 3).double()
     counting = torch.ones_like(colors[:, 0], dtype=torch.bool) if mask is None else mask.ravel()
     dark, bright = 0.5 / 255, 1 - 0.5 / 255  # beyond these, a pixel is clipped and says nothing about the map
-    seen = counting[:, None] & (target >= dark) & (target <= bright)
+    seen = counting[:, None] & (target >= dark) & (target <= bright) & (colors >= dark) & (colors <= bright)
     parts = [slice(start, start + AT_ONCE) for start in range(0, len(colors), AT_ONCE)]
     for _ in range(5):
         normal = colors.new_zeros(3, TERMS, TERMS)

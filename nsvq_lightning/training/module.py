@@ -242,7 +242,7 @@ class SplatModule(LightningModule):
         for callback in self.trainer.callbacks:  # type: ignore[attr-defined]  # Lightning does not type it
             if isinstance(callback, StochasticWeightAveraging | WeightAveraging):
                 raise ValueError(f"{type(callback).__name__} averages parameters, but splats come and go: leave it out")
-        self.evaluation_splats = None  # an interrupted evaluation may have left some
+        self.evaluation_splats = self.pixel_weights = None  # an interrupted evaluation or fit may have left some
         scene = run_scene.scene_of(self.trainer)
         if scene is not None:
             self.background = run_scene.background_of(scene, self.background)

@@ -98,6 +98,19 @@ def test_colour_correction_undoes_a_map_of_colours() -> None:
     assert torch.equal(color_corrected(torch.ones(4, 5, 3), torch.ones(4, 5, 3)), torch.ones(4, 5, 3))
 
 
+def test_colour_correction_leaves_out_what_the_image_clips() -> None:
+    generator = torch.Generator().manual_seed(0)
+    photo = torch.rand(60, 80, 3, generator=generator) * 0.9 + 0.05
+    image = (1.3 * photo).clamp(0, 1)
+    clipped = image == 1
+    corrected = color_corrected(image, photo)
+    # What is left of a gain is exact where all channels are known, and as dark as others of their colour elsewhere.
+    known = ~clipped.any(-1)
+    assert float((corrected - photo)[known].abs().max()) < 1e-6
+    spoiled = torch.where(clipped, torch.rand(photo.shape, generator=generator), photo)
+    torch.testing.assert_close(color_corrected(image, spoiled)[known], photo[known], atol=1e-5, rtol=0)
+
+
 class OneBadLoss(Callback):
     """Spoils the loss of one iteration, and notes the exposures around it."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -239,6 +240,8 @@ def test_it_asks_for_edges_during_warm_up_only() -> None:
     assert strength.shape == (HEIGHT, WIDTH)
     assert strength[:, WIDTH // 2].min() == 1.0
     assert strength.sum() == HEIGHT  # the bright side of the edge alone
+    stage.start_batch(120, replace(BATCH, image=PHOTO / 255))  # one's own photos may be floats
+    assert torch.equal(stage.module.pixel_weights, strength)
     stage.start_batch(121, BATCH)
     assert stage.module.pixel_weights is None
 
