@@ -253,8 +253,10 @@ class Compressor:
         if 8 * target >= ON_BASIS * splats or not self.scene.sh_degree:
             plain = Setting(splats, "none", self.scene.sh_degree > 0)
             exact = self.at(plain._replace(on_basis=False))
-            fits = exact if len(exact.data) <= target else self._fitting(plain, target)
-            if fits and (self.stopped or (fits is exact and self._is_own)):
+            tried = [each for each in (exact, self._fitting(plain, target)) if each and len(each.data) <= target]
+            # Faint harmonics have finer steps on a basis.
+            fits = min(tried, key=lambda each: self.error(each) * (1 + SLACK * each.setting.on_basis), default=None)
+            if fits and (self.stopped or (exact in tried and self._is_own)):
                 return fits
         coded = self._finest_coded(target, splats, not fits)
         if fits and coded:
@@ -320,9 +322,10 @@ class Compressor:
                 first = middle
                 found.append(candidate)
         if not found:
+            least = min((plain, self.at(settings[0])), key=self.error)
             raise ValueError(
-                f"no setting has an error of at most {error:g}: the most exact one has {self.error(plain):.3g} in "
-                f"{len(plain.data)} bytes; allow more, or use level 'paper' without codebooks, which loses nothing"
+                f"no setting has an error of at most {error:g}: the most exact one has {self.error(least):.3g} in "
+                f"{len(least.data)} bytes; allow more, or use level 'paper' without codebooks, which loses nothing"
             )
         return min(found, key=lambda each: len(each.data))
 

@@ -42,7 +42,7 @@ def atomic_path(path: StrPath) -> Iterator[Path]:
     try:
         yield temporary
         _sync(temporary, os.O_RDWR)  # not read-only: Windows flushes only files that are open for writing
-        with suppress(FileNotFoundError):
+        with suppress(OSError):  # no file before, or one where modes cannot be set
             temporary.chmod(target.stat().st_mode & 0o7777)
         os.replace(temporary, target)
     except BaseException as error:

@@ -49,7 +49,8 @@ def write_lod(
     Raises:
         ValueError: A level is not coarser than the one before it.
     """
-    levels = [scene, *(CompressedScene.from_splats(level).finite() for level in coarser)]
+    coarse = [CompressedScene.from_splats(level).finite() for level in coarser]
+    levels = [scene, *(level.relative_to(scene.origin) if any(level.origin) else level for level in coarse)]
     target = Path(path)
     counts = [len(level) for level in levels]
     if any(a <= b for a, b in pairwise(counts)):
@@ -199,4 +200,5 @@ def read_lod(path: StrPath) -> CompressedScene:
     path = Path(path)
     parts = [read_sog(path.parent / name) for name in _index(path)["shown"]]
     size = path.stat().st_size + sum(part.stored_bytes or 0 for part in parts)
-    return replace(CompressedScene.joined(parts), stored_bytes=size)
+    # The surroundings may be of another kind; splats are shown as one.
+    return replace(CompressedScene.joined([replace(part, config=parts[0].config) for part in parts]), stored_bytes=size)

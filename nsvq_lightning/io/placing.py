@@ -71,7 +71,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     rotation = linear / size
     harmonics = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
     means, origin = scene.means @ linear.T, linear @ scene.origin
-    if any(scene.origin) or np.linalg.norm(shift) > FAR * middle_of(means)[1] > 0:
+    if any(scene.origin) or (len(means) and np.linalg.norm(shift) > FAR * middle_of(means)[1] > 0):
         origin += shift  # which moves, then, and not what is relative to it
         shift = np.zeros(3)
     cameras = scene.cameras.copy()

@@ -368,7 +368,7 @@ def _archived(path: Path) -> tuple[bytes, int]:
     text = path.read_text(encoding="utf-8", errors="replace")
     named = {name: path.parent / name for name in re.findall(r'"([^"]+)"', text) if name.lower().endswith(_PICTURES)}
     pictures = {name: file for name, file in named.items() if file.is_file()}
-    with ZipFile(buffer, "w") as archive:
+    with ZipFile(buffer, "w", strict_timestamps=False) as archive:  # some are of 1970
         archive.write(path, META)
         for name, picture in pictures.items():
             archive.write(picture, name)

@@ -143,6 +143,17 @@ def test_more_bytes_never_cost_quality() -> None:
     assert found[-1].setting == Setting(1000, "none")
 
 
+def test_faint_harmonics_are_finer_on_a_basis_than_without() -> None:
+    scene = ball(400)
+    faint = compressor(replace(scene, raw={**scene.raw, "shN": 0.1 * scene.raw["shN"]}))
+    plain, basis = (faint.at(Setting(400, "none", on_basis)) for on_basis in (False, True))
+    assert len(basis.data) > len(plain.data)
+    assert faint.error(basis) < faint.error(plain)
+    assert faint.finest_within(len(basis.data), 400).data == basis.data
+    with pytest.raises(ValueError, match=f"the most exact one has .* in {len(basis.data)} bytes"):
+        faint.smallest_within(1e-9, 400)
+
+
 def test_a_basis_needs_no_room_for_codebooks() -> None:
     few = compressor(ball(60))
     target = len(few.at(Setting(60, "none", True, 0.3)).data)

@@ -69,6 +69,18 @@ def test_permissions_are_those_of_an_ordinary_file_or_of_the_old_one(tmp_path: P
         ours.chmod(0o640)
 
 
+def test_a_file_is_replaced_where_modes_cannot_be_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a").write_bytes(b"old")
+
+    def refuse(*_: object) -> None:
+        raise PermissionError("no modes on this share")
+
+    monkeypatch.setattr(Path, "chmod", refuse)
+    with atomic_write(tmp_path / "a") as file:
+        file.write(b"new")
+    assert (tmp_path / "a").read_bytes() == b"new"
+
+
 def test_link_is_followed(tmp_path: Path) -> None:
     (tmp_path / "store").mkdir()
     target, link = tmp_path / "store" / "v1.ply", tmp_path / "latest.ply"

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +73,13 @@ def test_an_index_of_the_first_writers_and_what_surrounds_a_scene(tmp_path: Path
     )
     nearest_in(arrays_of(read.take(np.arange(20))), arrays_of(scene))
     nearest_in(arrays_of(read.take(np.arange(20, 28))), arrays_of(sky))
+    blurred = replace(sky, config={"antialiased": True})
+    save(blurred, tmp_path / "env.sog")
+    assert blurred.antialiased
+    assert not read_scene(path).antialiased
+    for file in tmp_path.rglob("*.*"):
+        os.utime(file, (0, 0))  # as reproducible archives have it
+    assert len(read_scene(path)) == 28
     path.write_text(json.dumps(index | {"environment": "../env.sog"}))
     with pytest.raises(FormatError, match=r"is no FOLDER/meta\.json or \.sog beside it"):
         read_scene(path)
@@ -89,6 +98,13 @@ def test_a_new_scene_takes_the_place_of_one_that_names_its_folders_otherwise(tmp
     path.write_text(json.dumps(index | {"asset": {"generator": "another"}, "filenames": ["mine/meta.json"]}))
     save(plain_scene(30, 1), path)
     assert (tmp_path / "mine" / "meta.json").exists()
+
+
+def test_levels_of_other_origins_are_put_in_place(tmp_path: Path) -> None:
+    scene, path = replace(plain_scene(20, 1), origin=(5e5, 4e6, 0.0)), tmp_path / "lod-meta.json"
+    save(scene, path, coarser=[scene.take(np.arange(7)).relative_to((5e5 + 50, 4e6, 0.0))])
+    bounds = json.loads(path.read_text())["tree"]["bound"]
+    assert bounds["max"][0] - bounds["min"][0] < 1.5 * np.ptp(scene.means[:, 0])
 
 
 def test_levels_become_coarser(tmp_path: Path) -> None:

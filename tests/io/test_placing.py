@@ -109,3 +109,8 @@ def test_a_drone_that_turns_above_the_ground_looks_down(up: list[float]) -> None
         views.append(view_from(lift @ turn.as_matrix(), lift @ np.array([number % 4, -30.0, number // 4])))
     cameras = [Camera(torch.eye(3), view, 40, 30) for view in views]
     np.testing.assert_allclose(up_of(cameras), up, atol=0.03)
+
+
+def test_nothing_is_moved_of_an_empty_scene() -> None:
+    empty = ball(2).take(np.zeros(0, np.int64))
+    assert len(moved(empty, np.c_[np.eye(3), np.ones(3)])) == 0
