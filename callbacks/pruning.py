@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import torch
 from lightning.pytorch import Trainer
 
 from nsvq_lightning.random import top_rows
@@ -79,7 +80,7 @@ class SplatSelection(SplatCallback):
             return
         splats = below_cap(module.splats.raw())
         views = run_scene.train_sensitivities(trainer, module.scene, module.seed, splats, VIEWS)
-        squares = sum((found.opacities for _, found, _ in views), splats.opacities.new_zeros(len(splats.opacities)))
+        squares = sum((found.opacities for _, found, _ in views), torch.zeros_like(splats.opacities))
         effects = likely_effects(splats, distributed.sum_over_processes(trainer, squares))
         row_ops.keep_rows(module.splats, trainer.optimizers[0], top_rows(effects, budget))
         distributed.check_replicas(trainer, "the selection")

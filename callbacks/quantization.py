@@ -1,5 +1,6 @@
 """What the quantize and fine-tune phases do to codebooks and codes: place, refit, replace, mend, freeze."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import field
 from typing import Any
@@ -81,7 +82,7 @@ class CodebookInit(SplatCallback):
 
     def tell(self, module: SplatModule) -> None:
         """Tell how large codebooks may be."""
-        module.values_per_splat = self.values_per_splat or torch.inf
+        module.values_per_splat = self.values_per_splat or math.inf
 
     def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Look for the train views now, not after most of the training.
