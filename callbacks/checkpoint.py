@@ -10,7 +10,7 @@ import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
-from nsvq_lightning.io.atomic import atomic_path, make_folder_of
+from nsvq_lightning.io.atomic import atomic_path, make_folder_of, optional
 from nsvq_lightning.top_level import log
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.module import SplatModule
@@ -96,7 +96,8 @@ class RunCheckpoint(WritingCallback, Checkpoint):
 
     ``fit --ckpt_path …/last.ckpt`` continues exactly where it was saved. Lightning calls checkpoint callbacks after all
     others, so a checkpoint holds the finished step. Saving does not count as training time. Files are written
-    atomically: the previous one stays until the new one is complete.
+    atomically: the previous one stays until the new one is complete. If one cannot be written, as on a full disk, a run
+    of one process warns and goes on; if it is the last one, the run fails once its scene is written.
 
     Ctrl-C and SIGTERM stop the run after the current iteration, with a checkpoint of it; a second one stops it at once.
     Several processes stop together after the iteration in which any of them receives a signal. After an exception,
@@ -120,7 +121,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     # Path of ``last_path`` under the name by which Lightning looks for ``ckpt_path="best"``.
     best_model_path = ""
     _saved = -1
-    _training = False
+    _missing = _training = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -171,6 +172,15 @@ class RunCheckpoint(WritingCallback, Checkpoint):
         self._stop.deliver(self._stop.received(trainer, now=True))
         self._stop.release()
 
+    def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
+        """Fail where the end of the run could not be saved, now that other callbacks have written what is left of it.
+
+        Raises:
+            OSError: Its checkpoint could not be written.
+        """
+        if self._missing:
+            raise OSError("the end of the run has no checkpoint: make room, then continue from the last one")
+
     def on_exception(self, trainer: Trainer, module: SplatModule, exception: BaseException) -> None:
         """Say where to continue from."""
         self._stop.release()
@@ -190,12 +200,14 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     def _save(self, trainer: Trainer, module: SplatModule) -> None:
         if is_fast_dev_run(trainer):
             return
-        folder = run_folder(trainer) / "checkpoints"
-        with module.stopwatch.paused(module.device):
+        self._missing = True
+        last = run_folder(trainer) / "checkpoints" / "last.ckpt"
+        # One process alone can go on without: others would wait for it where a save ends.
+        with module.stopwatch.paused(module.device), nullcontext() if trainer.world_size > 1 else optional(last):
             if self.keep:
-                _write(trainer, folder / f"step-{trainer.global_step}.ckpt")
-            _write(trainer, folder / "last.ckpt")
-        self.best_model_path, self._saved = str(folder / "last.ckpt"), trainer.global_step
+                _write(trainer, last.with_name(f"step-{trainer.global_step}.ckpt"))
+            _write(trainer, last)
+            self.best_model_path, self._saved, self._missing = str(last), trainer.global_step, False
 
 
 def _write(trainer: Trainer, path: Path) -> None:

@@ -234,6 +234,26 @@ def test_a_checkpoint_that_cannot_be_written_harms_no_other(
     assert (iteration_of(path), good) == (5, [5])
 
 
+def test_a_run_goes_on_where_a_checkpoint_cannot_be_written(
+    run: RunFactory, recipe: Recipe, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    save, refused = Trainer.save_checkpoint, {4}
+
+    def sometimes(trainer: Trainer, path: Path, **kwargs: Any) -> None:
+        if trainer.global_step in refused:
+            raise PermissionError(13, "held by another program")
+        save(trainer, path, **kwargs)
+
+    monkeypatch.setattr(Trainer, "save_checkpoint", sometimes)
+    trainer, _ = run(recipe(checkpoint=RunCheckpoint(every=2)).values(), max_steps=8)
+    assert iteration_of(run_folder(trainer) / "checkpoints" / "last.ckpt") == 8
+    assert "last.ckpt cannot be written (held by another program); the run goes on without it" in caplog.text
+    refused.add(8)
+    path = Runner(run, recipe, "paper", max_steps=8).stopped(OSError, Callback(), every=2)
+    assert iteration_of(path) == 7  # the end of a phase
+    assert (path.parents[1] / "scene.nsvq").is_file()  # nothing but the checkpoint is missing
+
+
 def test_a_run_continued_with_another_length_says_what_follows_from_it(
     run: RunFactory, recipe: Recipe, caplog: pytest.LogCaptureFixture
 ) -> None:
