@@ -13,7 +13,8 @@ from typing import Any, Literal, TypeVar, get_args
 import cv2
 import numpy as np
 import torch
-from scipy.spatial import cKDTree, distance_matrix
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 from torch import Tensor
 from tqdm import tqdm
 
@@ -635,7 +636,7 @@ def stretch(scene: Scene) -> float:
     It is 1 where a fifth of the train photos or more show the usual point, or few points say so.
     """
     cameras, places = spread(scene.train_cameras, SOME_CAMERAS), spread(scene.points, SOME_SPLATS).double().numpy()
-    apart = distance_matrix([camera.packed_view[12:] for camera in cameras], places)
+    apart = cdist([camera.packed_view[12:] for camera in cameras], places)
     apart[~seen_by(cameras, places)] = math.inf
     # What is more than twice as far away as in the nearest photo, as behind a wall, is not shown.
     shares = (apart < 2 * apart.min(0)).mean(0)
