@@ -14,6 +14,7 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
 from nsvq_lightning.io.atomic import StrPath, remove_temporaries, write_text
+from nsvq_lightning.top_level import log
 from nsvq_lightning.training.distributed import on_first_process
 
 _FOLDERS: WeakKeyDictionary[Trainer, Path] = WeakKeyDictionary()
@@ -119,6 +120,8 @@ def hold(folder: Path) -> None:
             f"another run is writing to {folder} now, process {owner.strip() or 'that has just started'}: wait until "
             "it has ended, or name another folder"
         ) from None
+    except OSError as error:  # some network file systems have no locks
+        log.warning(f"{folder} cannot be locked ({error.strerror}): write no other run there meanwhile")
     remove_temporaries(folder, owner.partition(" ")[0])
     write_text(marker, f"{os.getpid()} on {platform.node()}\n")
     _HELD[folder.resolve()] = lock

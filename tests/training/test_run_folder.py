@@ -156,6 +156,20 @@ def test_a_killed_run_holds_no_folder_and_what_it_left_unfinished_goes(tmp_path:
     assert not (tmp_path / LOCK).exists()
 
 
+def test_a_folder_that_cannot_be_locked_is_used_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def no_locks(*_: object) -> None:
+        raise OSError(37, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", no_locks)
+    hold(tmp_path)
+    assert f"{tmp_path} cannot be locked (No locks available)" in caplog.text
+    assert (tmp_path / MARKER).exists()
+    let_go(tmp_path)
+    assert not (tmp_path / MARKER).exists()
+
+
 def test_nobody_continues_a_run_in_its_folder_while_it_trains(tmp_path: Path) -> None:
     (tmp_path / "scene.nsvq").touch()
     hold(tmp_path)
