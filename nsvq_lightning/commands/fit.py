@@ -5,6 +5,7 @@ import math
 import os
 import shlex
 import sys
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -251,7 +252,8 @@ class SplatCLI(LightningCLI):
         """Print a summary."""
         path = run_folder(self.trainer) / "metrics.json"
         if self.trainer.is_global_zero and path.is_file():
-            sys.stdout.write(summary(path.parent, json.loads(path.read_bytes())))
+            with suppress(OSError):  # nobody may read it any more
+                sys.stdout.write(summary(path.parent, json.loads(path.read_bytes())))
 
 
 def continuation(checkpoint: Path) -> str:

@@ -233,6 +233,7 @@ def _import_cli(own_process: bool) -> Any:
     """
     if own_process:
         gc.disable()
+        atexit.register(_hush)
     try:
         from nsvq_lightning.commands.fit import SplatCLI
     finally:
@@ -240,6 +241,12 @@ def _import_cli(own_process: bool) -> Any:
             gc.freeze()
             gc.enable()
     return SplatCLI
+
+
+def _hush() -> None:
+    """Let libraries of nanobind, such as Triton's, not complain at the very end of what was kept from the collector."""
+    sys.stderr.flush()
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 
 
 def _is_ours(error: BaseException) -> bool:
