@@ -76,6 +76,9 @@ class RunStart(SaveConfigCallback):
             for option in ("data.init_args.root", "model.init_from"):
                 if isinstance(given := self.config.get(option), str):  # so that it is found from any folder
                     self.config[option] = os.path.abspath(os.path.expanduser(given))
+            for option in ("model.seed", "data.init_args.seed"):  # which follow it, also another one
+                if self.config.get(option) == self.config.seed_everything:
+                    self.config[option] = 0
             self.config["ckpt_path"] = None  # who repeats a run does not continue it
             self._write(folder)
 

@@ -1,6 +1,5 @@
 """The parser of Lightning's commands: help with every option once, and errors in one line of plain words."""
 
-import inspect
 import json
 import re
 import shutil
@@ -14,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple, NoReturn
 
 from jsonargparse import Namespace
 from jsonargparse import _typehints as typehints
+from jsonargparse._parameter_resolvers import get_signature_parameters
 from lightning.pytorch.cli import LightningArgumentParser
 
 from nsvq_lightning import callbacks, quantize
@@ -62,9 +62,9 @@ def _drop_settings_of_another_class(_: Any, before: Any, value: Any) -> None:
         old = resolve_name(before["class_path"])
         new = resolve_name(value["class_path"])
         derived = isinstance(old, type) and isinstance(new, type) and issubclass(new, old)
-        defaults = inspect.signature(old).parameters
+        defaults = {each.name: each.default for each in get_signature_parameters(old)}  # also those behind **settings
         for name, setting in list(before.init_args.items(branches=True, nested=False)):
-            if not derived or setting in (None, defaults[name].default):
+            if not derived or setting in (None, defaults[name]):
                 before.init_args.pop(name)
 
 

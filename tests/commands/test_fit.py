@@ -78,6 +78,43 @@ def test_the_seed_of_everything_is_that_of_every_draw(
     assert seen == [seeds]
 
 
+def test_a_run_is_repeated_with_another_seed(demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    short = "--model.codebooks=null", "--trainer.max_steps=2"
+    assert main(fit(demo_scene, tmp_path, "--seed_everything=3", *short)) == 0
+    config = tmp_path / demo_scene.name / "version_0" / "config.yaml"
+    seen = []
+    monkeypatch.setattr(SplatCLI, "_run_subcommand", lambda command, _: seen.append(command.model.seed))
+    for more in ([], ["--seed_everything=5"]):
+        assert main(["fit", f"--config={config}", *more]) == 0
+    assert seen == [3, 5]
+
+
+OWN = """
+from nsvq_lightning.quantize import TrainedStraightThrough
+
+class Mine(TrainedStraightThrough):
+    def __init__(self, num_codes, dim, *, weight=2.0, **settings):
+        super().__init__(num_codes, dim, **settings)
+        self.weight = weight
+"""
+
+
+def test_a_quantizer_of_ones_own_takes_the_place_of_the_one_it_derives_from(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_quantizer.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    seen = []
+    monkeypatch.setattr(SplatCLI, "_run_subcommand", lambda command, _: seen.append(command.config.fit.model.quantizer))
+    kind = "own_quantizer.Mine"
+    for more in ([], ["--model.quantizer.weight=3.0"]):
+        options = ["--model.quantizer.kmeans_steps=7", f"--model.quantizer={kind}", *more]
+        assert main(fit(demo_scene, tmp_path, *options)) == 0
+    assert [each.class_path for each in seen] == [kind, kind]
+    assert [each.init_args.kmeans_steps for each in seen] == [7, 7]  # that was asked for
+    assert [each.init_args.weight for each in seen] == [2.0, 3.0]
+
+
 def test_checkpoints_of_the_command_line_are_plain_data_and_load(finished: Path) -> None:
     path = finished / "checkpoints" / "last.ckpt"
     stored = torch.load(path, weights_only=True)
