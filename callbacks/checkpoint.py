@@ -179,7 +179,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
             OSError: Its checkpoint could not be written.
         """
         if self._missing:
-            raise OSError("the end of the run has no checkpoint: make room, then continue from the last one")
+            raise OSError("last.ckpt is not of the end of the run, which could not be written: make room, and continue")
 
     def on_exception(self, trainer: Trainer, module: SplatModule, exception: BaseException) -> None:
         """Say where to continue from."""

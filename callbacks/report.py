@@ -4,7 +4,6 @@ from typing import Any
 
 import torch
 from lightning.pytorch import Trainer
-from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from torch import Tensor
 from torchmetrics import Metric
 
@@ -28,14 +27,17 @@ from .settings import Whole
 
 
 def notify_monitors(trainer: Trainer, module: SplatModule) -> None:
-    """Let early stopping and checkpoints with a monitor act now; those of ``train/…`` once that has been logged.
+    """Let callbacks with a ``monitor``, as early stopping has, act now; those of ``train/…`` once that has been logged.
 
     They wait for the end of an epoch or a validation, depending on their settings and the trainer's, and act in one of
-    these hooks. Here the sampler is endless and no validation runs, so neither ever comes.
+    these hooks. Here the sampler is endless and no validation runs, so neither ever comes. Where validation is asked
+    for, it calls those of ``val/…`` itself.
     """
     for watcher in trainer.callbacks:  # type: ignore[attr-defined]  # Lightning does not type it
-        monitor = watcher.monitor if isinstance(watcher, EarlyStopping | ModelCheckpoint) else None
-        if monitor and (monitor in trainer.callback_metrics or not monitor.startswith("train/")):
+        monitor = getattr(watcher, "monitor", None)
+        if not isinstance(monitor, str) or (monitor.startswith("val/") and trainer.enable_validation):
+            continue
+        if monitor in trainer.callback_metrics or not monitor.startswith("train/"):
             watcher.on_train_epoch_end(trainer, module)
             watcher.on_validation_end(trainer, module)
 
@@ -109,7 +111,8 @@ class MetricReport(WritingCallback):
             return
         if not getattr(scene_of(trainer), "test", ()):
             return
-        views = trainer.datamodule.val_dataloader()  # type: ignore[attr-defined]  # Lightning does not type it
+        loader = trainer.datamodule.val_dataloader()  # type: ignore[attr-defined]  # Lightning does not type it
+        views = map(trainer.strategy.batch_to_device, loader)  # as training and validation have them
         with module.stopwatch.paused(module.device), self._beside.timed("evaluations"):
             self._evaluate(trainer, module, iteration, views)
             notify_monitors(trainer, module)

@@ -66,10 +66,9 @@ def run(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFactor
         trainer = quiet_trainer(
             tmp_path_factory.mktemp("run"),
             STEPS,
-            limit_val_batches=0,
             enable_checkpointing=any(isinstance(c, Checkpoint) for c in callbacks),
             callbacks=callbacks,
-            **trainer_arguments,
+            **{"limit_val_batches": 0} | trainer_arguments,
         )
         splat_module = SplatModule(**PAPER_MODULE | {"sh_degree": 1, "codebooks": CODES} | (module or {}))
         trainer.fit(splat_module, datamodule=ColmapDataModule(str(scene), factor=2), ckpt_path=ckpt_path)

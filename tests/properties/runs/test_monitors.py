@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from lightning.pytorch import Callback, Trainer
+from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from runs import Recipe, RunFactory
 
 from nsvq_lightning.callbacks import MetricReport, RunCheckpoint
 from nsvq_lightning.data.datamodule import ColmapDataModule
+from nsvq_lightning.data.scene import View
 from nsvq_lightning.training.run_folder import run_folder
 
 
@@ -75,6 +78,43 @@ def test_metrics_of_the_module_are_watched_and_unknown_ones_refused_at_the_first
     with pytest.raises(RuntimeError, match="conditioned on metric `val/psnr` which is not available"):
         run([*recipe(report=MetricReport(every=5)).values(), Steps(), EarlyStopping("val/psnr", verbose=False)])
     assert max(seen) <= 5
+
+
+def test_what_monitors_validation_is_called_by_it_alone(run: RunFactory, recipe: Recipe, tmp_path: Path) -> None:
+    best = ModelCheckpoint(tmp_path, "{step}", monitor="val/psnr", mode="max", save_top_k=-1)
+    options: dict[str, Any] = {"limit_val_batches": 1.0, "val_check_interval": 8, "max_steps": 20}
+    run([*recipe(report=MetricReport(every=5)).values(), best], **options)
+    assert {int(Path(path).stem.partition("=")[2]) for path in best.best_k_models} == {8, 16}
+
+
+class Watcher(Callback):
+    """Has a monitor, and notes when it is called."""
+
+    monitor = "report/psnr"
+
+    def __init__(self) -> None:
+        self.seen: list[int] = []
+
+    def on_validation_end(self, trainer: Trainer, module: LightningModule) -> None:
+        self.seen.append(trainer.global_step)
+
+
+def test_any_callback_with_a_monitor_is_called(run: RunFactory, recipe: Recipe) -> None:
+    watcher = Watcher()
+    _, module = run([*recipe(report=MetricReport(every=5)).values(), watcher], max_steps=20)
+    assert watcher.seen == [entry["iteration"] for entry in module.history]
+
+
+def test_the_report_has_the_photos_that_the_module_has(
+    run: RunFactory, recipe: Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def darken(_: ColmapDataModule, batch: View, dataloader_idx: int) -> View:
+        return replace(batch, image=batch.image // 2)
+
+    monkeypatch.setattr(ColmapDataModule, "on_after_batch_transfer", darken)
+    options: dict[str, Any] = {"limit_val_batches": 1.0, "val_check_interval": 20, "max_steps": 20}
+    trainer, module = run(recipe().values(), **options)
+    assert float(trainer.callback_metrics["val/psnr"]) == pytest.approx(module.history[-1]["psnr"], abs=0.01)
 
 
 def test_tensorboard_gets_the_pictures_of_the_test(
