@@ -359,8 +359,8 @@ class Quantizer(Protocol):
     def replace_unused(self, generator: Generator, rows: Tensor | None = None, jitter: float = 0.5) -> Tensor:
         """Replace inactive codes by active ones and restart the window; returns the replaced codes ``[R]``.
 
-        Callbacks pass ``rows [N, D]`` and ``jitter`` only if configured to split codes by the distortion of these rows;
-        a quantizer that cannot do that may omit both parameters.
+        Callbacks pass ``rows [N, D]`` and ``jitter`` to split codes by the distortion of these rows, as they do by
+        default; a quantizer that cannot do that may omit both, and needs ``CodebookReplacement(jitter=None)``.
         """
 
     def freeze(self, codes: Tensor) -> None:
