@@ -1,5 +1,6 @@
 """Photos of a camera with distortion, as a pinhole camera would have taken them."""
 
+from functools import partial
 from typing import Any
 
 import cv2
@@ -114,12 +115,22 @@ class Undistortion:
         pixels = self._source_pixels()
         # a pixel or more from the centres of the border, or NaN where the ray leaves the domain of the camera model
         blank = ~np.all((pixels > -1) & (pixels < self.size), axis=-1)
-        columns, rows = (np.nan_to_num(pixels[..., i], nan=-1.0) for i in (0, 1))
+        pixels[blank] = np.nan
+        columns, rows = np.moveaxis(pixels, 2, 0).copy()
+        # Where the polynomial of a lens has turned back, it shows the picture once more: mirrored, then upside down.
+        slope = partial(cv2.Sobel, ddepth=cv2.CV_32F, ksize=1, borderType=cv2.BORDER_REPLICATE)
+        right, down = {"dx": 1, "dy": 0}, {"dx": 0, "dy": 1}
+        turned = slope(columns, **right) * slope(rows, **down) < slope(columns, **down) * slope(rows, **right)
+        if turned.any():
+            regions = cv2.connectedComponents((~blank & ~turned).view(np.uint8))[1]
+            middle = np.clip(self.pinhole.K[[1, 0], 2].astype(int), 0, np.subtract(blank.shape, 1))
+            blank |= turned | (regions != regions[*middle])
+        columns, rows = (np.nan_to_num(each, nan=-1.0) for each in (columns, rows))
         if blank.any() and not self._warned:
             self._warned = True
             log.warning(
                 f"camera {self._camera.camera_id} ({self._camera.model_name}): {100 * blank.mean():.1f} % of the "
-                "pinhole image is left out: its field of view is too wide for a pinhole"
+                "pinhole image is left out: its field of view is too wide for a pinhole, or for its lens polynomial"
             )
         if self._keep_maps:
             self._maps = columns, rows, blank

@@ -130,6 +130,24 @@ def test_pixels_that_the_camera_never_saw_are_black_and_told_once(
     assert "of the pinhole image is left out" in message
 
 
+@pytest.mark.parametrize("focal", [300.0, 240.0])
+def test_a_picture_is_shown_once_where_the_polynomial_turns_back(
+    focal: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    """r (1 + k r²) is largest at r² = -1 / 3k, and negative beyond r² = -1 / k."""
+    pinhole, undistortion = rectify(_camera("SIMPLE_RADIAL", (focal, 200.0, 150.0, -0.35)), 400, 300)
+    assert undistortion is not None
+    count = undistortion(_picture(400, 300))[1]
+    assert count is not None
+    rows, columns = np.indices(count.shape) + 0.5
+    radius = np.hypot((columns - pinhole.K[0, 2]) / pinhole.K[0, 0], (rows - pinhole.K[1, 2]) / pinhole.K[1, 1])
+    turn = (1 / (3 * 0.35)) ** 0.5
+    assert radius.max() > 1.3 * turn
+    assert not count[radius > 1.02 * turn].any()
+    assert count[radius < 0.98 * turn].all()
+    assert "or for its lens polynomial" in caplog.text
+
+
 def test_spherical_camera_is_refused() -> None:
     pycolmap = import_pycolmap()
     if "EQUIRECTANGULAR" not in pycolmap.CameraModelId.__members__:
