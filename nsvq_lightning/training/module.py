@@ -234,10 +234,10 @@ class SplatModule(LightningModule):
                 scene or a strategy that loses replaced parameters.
         """
         check_can_train(self.trainer.strategy.root_device, self.backend)
-        if self.trainer.precision != "32-true":
+        if self.trainer.precision != "32-true" or self.dtype != torch.float32:
             raise ValueError(
                 "splats train in float32, and kernels compute in it whatever trainer.precision says; a scaled loss "
-                "would grow splats needlessly: leave it at 32-true"
+                "would grow splats needlessly: leave it at 32-true, and the module as it is made"
             )
         for callback in self.trainer.callbacks:  # type: ignore[attr-defined]  # Lightning does not type it
             if isinstance(callback, StochasticWeightAveraging | WeightAveraging):

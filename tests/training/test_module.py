@@ -233,6 +233,12 @@ def test_splats_of_another_precision_are_trained_in_float32() -> None:
     assert torch.equal(splats.means, make_splats().means)
 
 
+def test_a_module_made_double_is_refused_at_once(demo_scene: Path) -> None:
+    trainer = SplatTrainer(max_steps=4, callbacks=[], enable_checkpointing=False, enable_progress_bar=False)
+    with pytest.raises(ValueError, match="splats train in float32"):
+        trainer.fit(SplatModule(codebooks=None).double(), ColmapDataModule(demo_scene))
+
+
 def test_a_module_is_saved_where_its_files_are(
     module: SplatModule, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
