@@ -5,6 +5,7 @@ It has y up: our right, down, front turned half around z.
 
 import re
 from pathlib import Path
+from warnings import catch_warnings
 
 import numpy as np
 
@@ -115,7 +116,7 @@ def _rows(text: str, name: str, width: int) -> Float32s:
     for each in (name, f"{name}h"):
         value = r"(?:=|\.timeSamples\s*=\s*\{[^:\[]*:)\s*\[([^\]]*)\]"
         if found := re.search(rf"\[\]\s*{each}\s*{value}", text):
-            numbers = re.sub(r"[(),]", " ", found[1]).split()
-            with as_defect(f"damaged: {name}", ValueError):
-                return np.array(numbers, np.float32).reshape(-1, width)
+            numbers = re.sub(r"[(),]", " ", found[1])
+            with as_defect(f"damaged: {name}", (ValueError, DeprecationWarning)), catch_warnings(action="error"):
+                return np.fromstring(numbers, np.float32, sep=" ").reshape(-1, width)
     raise FormatError(f"truncated: {name} has no end" if name in text else f"no attribute {name}")

@@ -130,6 +130,15 @@ def test_axes_and_unit_of_the_stage(tmp_path: Path) -> None:
     np.testing.assert_allclose(small.values("scales"), plain.values("scales") - np.log(100), atol=1e-5)
 
 
+def test_a_word_among_numbers_is_damage(tmp_path: Path) -> None:
+    save(plain_scene(3, 0), tmp_path / "x.usda")
+    text = (tmp_path / "x.usda").read_text()
+    start = text.index("float[] opacities = [") + len("float[] opacities = [")
+    (tmp_path / "x.usda").write_text(f"{text[:start]}0.5, many, {text[start:]}")
+    with pytest.raises(FormatError, match="damaged: opacities"):
+        read_scene(tmp_path / "x.usda")
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
