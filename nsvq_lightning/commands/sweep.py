@@ -137,6 +137,7 @@ def plan(options: Namespace) -> list[Run]:
     for scene in filter(None, options.scenes):
         if not Path(scene).is_dir():
             raise ValueError(f"{scene} is no folder; --scenes takes COLMAP folders with commas between them")
+    log.info("planning the runs takes half a second for each")
     common = [*options.further, "--trainer.logger=false"]
     if steps := options.max_steps:
         common += [f"--trainer.max_steps={steps}", "--callbacks.phases.iterations_per_photo=null"]

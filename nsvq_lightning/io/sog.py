@@ -73,6 +73,9 @@ def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
     wide = scene.means.astype(np.float64)
     logs = np.copysign(np.log1p(np.abs(wide)), wide)
     low, high = logs.min(0), logs.max(0)
+    steps = (high - low) / 65535 * (1 + np.abs(wide))
+    if np.median(steps.max(1)) > np.exp(np.median(scene.rows("scales"))):
+        log.warning("positions of .sog are rounded by half a splat, as they are far from 0: .spz keeps them")
     halves = _low_and_high(np.rint(65535 * ((logs - low) / np.where(high > low, high - low, 1))))
     scales, scale_levels = _leveled(scene.rows("scales"))
     colors, color_levels = _leveled(scene.rows("sh0"))

@@ -55,6 +55,16 @@ def test_a_palette_may_have_more_texels_than_the_file_has_bytes(tmp_path: Path) 
     np.testing.assert_allclose(abs(read_scene(path).rows("shN")), 0.2, atol=0.01)
 
 
+def test_a_scene_too_wide_for_its_steps_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    near = random_splats(1000, sh_degree=0)
+    save(near, tmp_path / "near.sog")
+    assert not caplog.records
+    near.means[:500, 0] += 4000
+    near.scales[:] -= 3
+    save(near, tmp_path / "wide.sog")
+    assert "positions of .sog are rounded by half a splat" in caplog.text
+
+
 @pytest.mark.parametrize("bands", range(4))
 def test_version_1_has_bounds_in_place_of_codebooks(tmp_path: Path, bands: int) -> None:
     """Oracle: low + (high - low) t / 255, number by number; the last of the colours is the logit of the opacity."""
