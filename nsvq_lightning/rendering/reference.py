@@ -138,13 +138,13 @@ def render(splats: RawSplats, camera: Camera, shading: Shading) -> Layers:
     direction = shown.means - camera.to(shown.means.device, shown.means.dtype).position
     direction = direction / direction.square().sum(-1, keepdim=True).clamp_min(1e-20).sqrt()
     features = torch.cat([sh_colors(direction, shown.sh0, shown.shN, sh_degree), projection.depths[:, None]], -1)
-    centres = means2d[rows]
+    projection = projection._replace(means2d=means2d[rows])
 
     order = torch.sort(projection.depths.detach(), stable=True).indices
-    low = (centres - projection.half_sizes).detach()[order]
-    high = (centres + projection.half_sizes).detach()[order]
+    low = (projection.means2d - projection.half_sizes).detach()[order]
+    high = (projection.means2d + projection.half_sizes).detach()[order]
     if pixel_weights is None or absgrad is None:
-        pixel_weights, absgrad = centres.new_zeros(camera.height, camera.width), centres.new_zeros(n, 3)
+        pixel_weights, absgrad = features.new_zeros(camera.height, camera.width), features.new_zeros(n, 3)
     watched = absgrad[rows]
     side = 32  # of the squares that are blended at a time, pixels
     strips = []
@@ -155,13 +155,11 @@ def render(splats: RawSplats, camera: Camera, shading: Shading) -> Layers:
             right = min(left + side, camera.width)
             here = (low[:, 0] <= right) & (high[:, 0] >= left) & (low[:, 1] <= bottom) & (high[:, 1] >= top)
             near = order[here]
-            down, across = torch.arange(top, bottom).to(centres), torch.arange(left, right).to(centres)
+            down, across = torch.arange(top, bottom).to(features), torch.arange(left, right).to(features)
             pixels = torch.cartesian_prod(down, across).flip(1) + 0.5
             weights_here = pixel_weights[top:bottom, left:right].ravel()
-            inputs = (
-                pixels, centres[near], projection.conics[near], projection.opacities[near], features[near],
-                weights_here, watched[near],
-            )  # fmt: skip
+            splats_here = Projection(*(each[near] for each in projection))
+            inputs = pixels, splats_here, features[near], weights_here, watched[near]
             blended = checkpoint(_blend, *inputs, use_reentrant=False)
             tiles.append(blended.view(bottom - top, right - left, 5))
         strips.append(torch.cat(tiles, 1))
@@ -197,17 +195,10 @@ class _WatchWeights(torch.autograd.Function):
         return gradient, None, pixel_weights @ weights if ctx.needs_input_grad[2] else None
 
 
-def _blend(
-    pixels: Tensor,
-    centres: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    pixel_weights: Tensor,
-    absgrad: Tensor,
-) -> Tensor:
+def _blend(pixels: Tensor, splats: Projection, features: Tensor, pixel_weights: Tensor, absgrad: Tensor) -> Tensor:
     """Front-to-back blend of sorted splats at ``pixels [P, 2]``: Σ w·feature and the transmittance left ``[P, 5]``."""
-    offsets: Tensor = _WatchOffsets.apply(pixels[:, None] - centres[None], absgrad[:, :2])  # type: ignore[no-untyped-call]
+    means2d, conics, opacities, _, _ = splats
+    offsets: Tensor = _WatchOffsets.apply(pixels[:, None] - means2d[None], absgrad[:, :2])  # type: ignore[no-untyped-call]
     dx, dy = offsets.unbind(-1)
     power = -0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) - conics[:, 1] * dx * dy
     alpha = (opacities * power.clamp_max(0).exp()).clamp_max(constants.ALPHA_MAX)
