@@ -8,7 +8,6 @@ from typing import Any
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import BasePredictionWriter
 
-from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import optional
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import FORMATS, save
@@ -120,11 +119,9 @@ class LiveScene(WritingCallback):
         self._running = not is_fast_dev_run(trainer)
         self._answered, self._next = viewer.live_asked(run_folder(trainer)), 0.0
 
-    def on_train_batch_end(
-        self, trainer: Trainer, module: SplatModule, outputs: Any, batch: View, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, *args: Any) -> None:
         """Answer a viewer."""
-        due = batch_idx % CHECKED_EVERY == 0 and time.monotonic() >= self._next
+        due = trainer.global_step % CHECKED_EVERY == 1 and time.monotonic() >= self._next
         if not (self._running and due and trainer.is_global_zero):
             return
         folder = run_folder(trainer)
