@@ -88,9 +88,8 @@ class RenderWriter(BasePredictionWriter):
 
     def write_on_batch_end(self, trainer: Trainer, module: SplatModule, prediction: Any, *args: Any) -> None:
         """Write one picture."""
-        if is_fast_dev_run(trainer):
-            return
-        pictures.write_png(picture_file(trainer, self._target, prediction["name"]), prediction["image"])
+        if not is_fast_dev_run(trainer):
+            pictures.write_png(picture_file(trainer, self._target, prediction["name"]), prediction["image"])
 
     def on_predict_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Say where the pictures are."""

@@ -107,9 +107,7 @@ class MetricReport(WritingCallback):
         """Evaluate an iteration that was not evaluated yet, and notify the callbacks that monitor it."""
         iteration = trainer.global_step
         done = module.history[-1]["iteration"] if module.history else 0
-        if iteration <= done or is_fast_dev_run(trainer):
-            return
-        if not getattr(scene_of(trainer), "test", ()):
+        if iteration <= done or is_fast_dev_run(trainer) or not getattr(scene_of(trainer), "test", ()):
             return
         loader = trainer.datamodule.val_dataloader()  # type: ignore[attr-defined]  # Lightning does not type it
         views = map(trainer.strategy.batch_to_device, loader)  # as training and validation have them
