@@ -14,7 +14,6 @@ import math
 import re
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -76,8 +75,8 @@ def run(options: Namespace) -> None:
     import torch
 
     from nsvq_lightning.compute.devices import best_device
+    from nsvq_lightning.io.compressed import renderer
     from nsvq_lightning.io.formats import read_scene
-    from nsvq_lightning.rendering.rasterize import render
     from nsvq_lightning.report.pictures import VIDEO, frame_writer
 
     file = scene_file(options.scene)
@@ -89,13 +88,8 @@ def run(options: Namespace) -> None:
     splats = scene.decode()
     cameras, fps = _path(options, splats, known, is_video)
     raw = splats.to(best_device()).raw()
-    look = partial(
-        render,
-        background=options.background or scene.background,
-        antialiased=scene.antialiased,
-        sampling=scene.sampling(),
-        backend=options.backend,
-    )
+    behind = options.background or scene.background
+    look = renderer(scene, background=behind, sampling=scene.sampling(), backend=options.backend)
     width, height = cameras[0].size
     with torch.no_grad(), frame_writer(output, width, height, fps) as write:
         for camera in tqdm(cameras, unit=" frames", mininterval=1):

@@ -374,11 +374,11 @@ def on_white(scene: CompressedScene) -> CompressedScene:
     return replace(scene, config={**scene.config, "background": "white"})
 
 
-def renderer(scene: CompressedScene) -> "Callable[[SplatTensors, Camera], Render]":
-    """:func:`nsvq_lightning.render` with the anti-aliasing and the background of a scene."""
+def renderer(scene: CompressedScene, **options: Any) -> "Callable[[SplatTensors, Camera], Render]":
+    """:func:`nsvq_lightning.render` with the anti-aliasing and the background of a scene, and with these options."""
     from nsvq_lightning.rendering.rasterize import render
 
-    return partial(render, background=scene.background, antialiased=scene.antialiased)
+    return partial(render, **{"background": scene.background, "antialiased": scene.antialiased, **options})
 
 
 def _check_floats(name: str, array: Float32s, shape: tuple[int, ...]) -> None:
