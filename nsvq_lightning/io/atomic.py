@@ -81,15 +81,15 @@ def make_folder_of(path: Path) -> None:
         raise PermissionError(f"cannot write {path}: its folder is read-only")
 
 
-def write_bytes(path: StrPath, content: bytes) -> None:
-    """Write a file in one step, see :func:`atomic_write`."""
+def write_bytes(path: StrPath, content: bytes) -> int:
+    """Write a file in one step, see :func:`atomic_write`; returns its bytes."""
     with atomic_write(path) as file:
-        file.write(content)
+        return file.write(content)
 
 
-def write_text(path: StrPath, text: str) -> None:
-    """Write a text file as UTF-8 in one step, see :func:`atomic_write`."""
-    write_bytes(path, text.encode())
+def write_text(path: StrPath, text: str) -> int:
+    """Write a text file as UTF-8 in one step, see :func:`atomic_write`; returns its bytes."""
+    return write_bytes(path, text.encode())
 
 
 @contextmanager

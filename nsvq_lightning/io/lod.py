@@ -70,8 +70,7 @@ def write_lod(
             folder = f"{target.name[: -len(NAME)]}{number}_{part}_{digest}"
             (target.parent / folder).mkdir(exist_ok=True)
             for name, data in contents.items():
-                write_bytes(target.parent / folder / name, data)
-                total += len(data)
+                total += write_bytes(target.parent / folder / name, data)
             offset = 0
             for rows, node in runs:
                 node["lods"][str(number)] = {"file": len(folders), "offset": offset, "count": len(rows)}
@@ -86,11 +85,10 @@ def write_lod(
         "filenames": [f"{folder}/{META}" for folder in folders],
         "tree": tree,
     }
-    text = json.dumps(about, separators=(",", ":"))
-    write_text(target, text)
+    total += write_text(target, json.dumps(about, separators=(",", ":")))
     for folder in {name.partition("/")[0] for name in old if name.count("/") == 1}.difference(folders):
         rmtree(target.parent / folder, ignore_errors=True)
-    return total + len(text)
+    return total
 
 
 def _tree(levels: Sequence[CompressedScene]) -> tuple[Json, list[tuple[list[Integers], Json]]]:

@@ -41,8 +41,7 @@ def write_splat(path: StrPath, scene: CompressedScene) -> int:
     clamped = Clamped()
     records = np.concatenate([_records(part, clamped) for part in scene.parts()])
     clamped.warn(path, len(scene))
-    write_bytes(path, records.tobytes())
-    return records.nbytes
+    return write_bytes(path, records.tobytes())
 
 
 def _records(scene: CompressedScene, clamped: Clamped) -> Records:

@@ -48,9 +48,7 @@ def write_viewer(path: StrPath, scene_file: StrPath, cameras: Mapping[str, Camer
         FormatError: ``scene_file`` is damaged or not a ``.nsvq`` file.
         ValueError: There are no cameras.
     """
-    page = viewer_page(scene_file, cameras, title)
-    write_text(path, page)
-    return len(page.encode())
+    return write_text(path, viewer_page(scene_file, cameras, title))
 
 
 def viewer_page(scene_file: StrPath, cameras: Mapping[str, Camera], title: str, live: float | None = None) -> str:
