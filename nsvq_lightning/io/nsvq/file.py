@@ -60,10 +60,9 @@ def write_nsvq(path: StrPath, scene: CompressedScene, storage: Storage | None = 
             f"numbers that are not finite ({listed(culprits)}): drop those splats, or use level 'paper', which stores "
             "float32 as it is"
         )
-    parts = frame(*encode(scene, storage))
     with atomic_write(path) as file:
-        file.writelines(parts)
-    return sum(map(len, parts))
+        file.writelines(frame(*encode(scene, storage)))
+        return file.tell()
 
 
 def as_stored(scene: CompressedScene, storage: Storage) -> CompressedScene:
