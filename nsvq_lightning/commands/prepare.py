@@ -10,6 +10,7 @@ Examples:
 """
 
 import json
+import os
 import shlex
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
@@ -115,13 +116,15 @@ def _claim(options: Namespace, is_video: bool, in_place: bool) -> None:
     path = scene / reconstruct.RECORD
     found = json.loads(path.read_bytes()) if path.is_file() else None
     if found is None:
-        own = {"images"} if in_place else set()
-        if scene.is_dir() and {each.name for each in scene.iterdir()} - own - {".DS_Store"}:
+        own = {"masks", ".DS_Store", "Thumbs.db", "desktop.ini", *(["images"] if in_place else [])}
+        if scene.is_dir() and {each.name for each in scene.iterdir()} - own:
             raise ValueError(f"{scene} is not empty and was not made by this command: name a new folder")
     elif not in_place and found.get("source") == str((scene / "images").resolve()):
         raise ValueError(f"{scene / 'images'} holds photos themselves, no copies: name a new folder for the scene")
     elif options.again:
         reconstruct.remove_database(scene)
+        for copy in () if in_place else (scene / "images").rglob("*.*"):
+            os.utime(copy)  # to be copied anew, whatever their dates say
         # The model stays until there is another, and is of no photo as it is now.
         if outdated := dict.fromkeys(reconstruct.stamps_in(scene / "sparse"), ""):
             write_text(scene / "sparse" / reconstruct.STAMPS, json.dumps(outdated))

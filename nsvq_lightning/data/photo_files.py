@@ -179,10 +179,10 @@ def find_masks(
         SceneError: A mask that the model names does not exist, or two files fit a photo.
     """
     given = [image.mask for image in images]
-    lost = [path for path in given if path and not path.is_file()]
+    lost = {path: None for path in given if path and not path.is_file()}
     if lost and folders[-1] == "masks":
-        raise SceneError(f"{len(lost)} masks do not exist, first {lost[0]}: copy them, or remove mask_path")
-    given = [None if path in lost else path for path in given]
+        raise SceneError(f"{len(lost)} masks do not exist, first {next(iter(lost))}: copy them, or remove mask_path")
+    given = [path and lost.get(path, path) for path in given]
     relative = [str(path.relative_to(photos)) if path.is_relative_to(photos) else path.name for path in files]
     named = [(image.name, name) for image, name in zip(images, relative, strict=True)]
     has_own = any(given) and folders[-1] == "masks"  # another folder is meant in their place
@@ -192,7 +192,7 @@ def find_masks(
         below = sorted({*root.glob("*"), *photos.glob("*")})
         places = [path for path in below if _OF_MASKS.search(path.name) and path.is_dir()]
         places.append(photos)
-    found = {place: masks for place in places if any(masks := _masks_in(place, named, files, place == photos))}
+    found = {place: masks for place in places if any(masks := masks_in(place, named, files, place == photos))}
     shown = " and ".join(map(str, found or usual or places[:-1]))
     if len(found) == 1:
         if not usual:
@@ -213,13 +213,11 @@ def find_masks(
     return given
 
 
-# What masks are called beside the stem of their photo.
-_MASK_NAMES = ("{}_mask", "{}.mask", "mask_{}")
+# What masks are called beside the stem of their photo, which may have been converted since.
+_MASK_NAMES = ("{}_mask", "{}.mask", "mask_{}", "{}.heic", "{}.webp", "{}.avif")
 
 
-def _masks_in(
-    folder: Path, named: Sequence[tuple[str, str]], photos: Sequence[Path], beside: bool
-) -> list[Path | None]:
+def masks_in(folder: Path, named: Sequence[tuple[str, str]], photos: Sequence[Path], beside: bool) -> list[Path | None]:
     """The masks in a folder of photos by either name: no photos; ``beside`` these, none has the name of its photo."""
     files = _Files(folder, sorted({*photos_below(folder)} - {*photos}))
     found: list[Path | None] = []

@@ -14,6 +14,7 @@ from io import BytesIO
 from pathlib import Path
 from shutil import rmtree
 from statistics import median_high
+from tempfile import TemporaryDirectory
 from threading import Event, Thread
 from typing import Any, NamedTuple
 
@@ -24,8 +25,8 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
-from nsvq_lightning.data.images import DAMAGED, ImageHead, read_image
-from nsvq_lightning.data.photo_files import PHOTOS, photos_below
+from nsvq_lightning.data.images import DAMAGED, ImageHead, read_image, read_mask, write_pixels
+from nsvq_lightning.data.photo_files import PHOTOS, masks_in, photos_below
 from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
 from nsvq_lightning.top_level import log
 
@@ -168,18 +169,20 @@ MIN_SHARED = 8
 
 
 def _extract(scene: Path, photos: Heads, report: Report, max_size: int, threads: int) -> dict[str, str]:
-    """Find features in photos that have none yet; returns the stamp of each photo."""
+    """Find features in photos that have none yet, outside their masks; returns the stamp of each photo."""
     pycolmap = import_pycolmap()
     images = scene / "images"
     groups = defaultdict(list)
     for name, head in photos.items():
         path = images / name
         groups[path.parent, head.size, _lens_of(path)].append(name)
+    kept = TemporaryDirectory()  # it goes with this function
+    masks = _write_masks(scene, photos, Path(kept.name))
     stamps = {}
     for group in groups.values():
         model = "OPENCV" if len(group) >= MIN_SHARED else "SIMPLE_RADIAL"
         for name in group:
-            stamps[name] = f"{model} {zlib.crc32((images / name).read_bytes()):08x}"
+            stamps[name] = f"{model} {zlib.crc32((images / name).read_bytes(), masks.get(name, 0)):08x}"
     known = stamps_in(scene)
     if not (scene / DATABASE).exists() or any(known.get(name, stamp) != stamp for name, stamp in stamps.items()):
         remove_database(scene)
@@ -190,6 +193,7 @@ def _extract(scene: Path, photos: Heads, report: Report, max_size: int, threads:
     done = 0
     for group in groups.values():
         reader = pycolmap.ImageReaderOptions(camera_model=stamps[group[0]].split()[0])
+        reader.mask_path = kept.name if masks else ""
         # The first one alone makes the camera of its group. COLMAP passes over photos that have features already.
         for batch in (group[:1], *(group[start : start + 4] for start in range(1, len(group), 4))):
             cameras = dict(_rows(scene, "select name, camera_id from images"))
@@ -208,15 +212,33 @@ def _extract(scene: Path, photos: Heads, report: Report, max_size: int, threads:
     return stamps
 
 
+def _write_masks(scene: Path, photos: Heads, folder: Path) -> dict[str, int]:
+    """Write the masks of a scene as COLMAP takes them, one for each photo and of its size; returns their checksums.
+
+    Raises:
+        SceneError: A mask is damaged or of another shape, or two fit a photo.
+    """
+    names = [(name, name) for name in photos]
+    found = masks_in(scene / "masks", names, [scene / "images" / name for name in photos], beside=False)
+    sums: dict[str, int] = {}
+    for (name, head), mask in zip(photos.items(), found if any(found) else (), strict=False):
+        counts = read_mask(mask, head.size) if mask else np.ones(head.size[::-1], np.bool_)
+        write_pixels(folder / f"{name}.png", 255 * counts.astype(np.uint8))
+        sums[name] = zlib.crc32(counts.tobytes())
+    return sums
+
+
 def _lens_of(path: Path) -> str:
     """What EXIF says of the camera and the lens of a photo."""
-    tags = Image.Exif()
+    tags, how = Image.Exif(), {}
     with Image.open(path) as image, suppress(*DAMAGED):
-        # Pillow decodes a whole PNG to look for it elsewhere.
-        tags.load(image.info.get("exif", b""))
-    how = tags.get_ifd(IFD.Exif)
+        if image.format != "PNG" or "exif" in image.info:  # Pillow decodes a whole PNG to look for it elsewhere
+            tags = image.getexif()
+        how = tags.get_ifd(IFD.Exif)
+    zoom = how.get(Base.DigitalZoomRatio)
+    lens = [tags.get(Base.Model), how.get(Base.FocalLength), how.get(Base.FocalLengthIn35mmFilm)]
     # As text: the number 0/0, which some write, is not equal to itself.
-    return str([tags.get(Base.Model), how.get(Base.FocalLength), how.get(Base.FocalLengthIn35mmFilm)])
+    return str(lens if zoom in (None, 0, 1) else [*lens, zoom])
 
 
 def stamps_in(folder: Path) -> dict[str, str]:

@@ -11,6 +11,8 @@ import numpy as np
 import PIL.Image
 import PIL.ImageCms
 import pytest
+from PIL.ExifTags import IFD, Base
+from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
 from nsvq_lightning.data import reconstruct
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap
@@ -309,6 +311,43 @@ def test_what_apps_export_beside_photos_is_left_out(tmp_path: Path) -> None:
     others = ("dense/0/images/1.jpg", "undistorted/images/1.jpg", "depth_maps/1.png", "semantics/1.png", "conf/1.png")
     _touch(tmp_path / "odm", "images/1.jpg", *others)
     assert _names_in(tmp_path / "odm")[0] == ["images/1.jpg"]
+
+
+def test_lenses_are_told_by_zoom_and_in_any_format(tmp_path: Path) -> None:
+    seen = []
+    for suffix in ("jpg", "tif", "png"):
+        for focal, zoom in ((24.0, 1.0), (48.0, 1.0), (24.0, 2.0)):
+            how = {Base.FocalLength: IFDRational(int(focal)), Base.DigitalZoomRatio: IFDRational(int(zoom))}
+            tags: Any = PIL.Image.Exif() if suffix != "tif" else ImageFileDirectory_v2()
+            tags[Base.Model.value] = "M"
+            if suffix == "tif":
+                tags[IFD.Exif.value] = how
+            else:
+                tags.get_ifd(IFD.Exif).update(how)
+            path = tmp_path / f"{focal}_{zoom}.{suffix}"
+            PIL.Image.new("RGB", (40, 30)).save(path, **{"tiffinfo" if suffix == "tif" else "exif": tags})
+            seen.append(reconstruct._lens_of(path))
+    assert len(set(seen)) == 3
+    assert seen[:3] == seen[3:6] == seen[6:]
+
+
+def test_masks_are_written_as_colmap_takes_them(tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        (tmp_path / "images").mkdir(exist_ok=True)
+        PIL.Image.new("RGB", (40, 30)).save(tmp_path / "images" / name)
+    heads = {name: image_head(tmp_path / "images" / name) for name in ("a.jpg", "b.jpg")}
+    assert reconstruct._write_masks(tmp_path, heads, tmp_path / "kept") == {}
+    mask = np.full((15, 20), 255, np.uint8)  # half as large
+    mask[:5] = 0
+    PIL.Image.fromarray(mask).save(tmp_path / "masks" / "a.HEIC.png")  # converted since
+    sums = reconstruct._write_masks(tmp_path, heads, tmp_path / "kept")
+    assert len(set(sums.values())) == 2
+    written = [np.asarray(PIL.Image.open(tmp_path / "kept" / f"{name}.png")) for name in heads]
+    assert [picture.shape for picture in written] == [(30, 40), (30, 40)]
+    assert not written[0][:10].any()
+    assert (written[0][10:] == 255).all()
+    assert (written[1] == 255).all()
 
 
 def test_copies_in_folders_keep_their_names(folders: tuple[Path, Path]) -> None:
