@@ -26,7 +26,8 @@ class Camera:
         viewmat: World to camera, rigid, ``[4, 4]``, scene units.
         width: Image width in pixels.
         height: Image height in pixels.
-        near: Splats whose centre is nearer than this along the viewing axis are not seen, scene units.
+        near: Splats whose centre is nearer than this along the viewing axis are not seen, scene units; 0.2 by default,
+            for scenes with an extent of about 5. In smaller units it must be less: ``Frame.around(positions).near``.
         limits: The :attr:`slope_limits` of another picture that are to hold in this one. One of another shape or focal
             length than those of training needs theirs: beyond, splats were never stretched so far, and would lie as
             streaks over what is in view.
@@ -97,7 +98,7 @@ class Camera:
     def smaller(self, times: int) -> "Camera":
         """The camera with pixels that are as large as squares of ``times`` pixels; what is left of one is cut off."""
         lens = tuple(number / times for number in self.intrinsics)
-        return camera_of(self.viewmat, lens, self.width // times, self.height // times, self.near)
+        return camera_of(self.viewmat, lens, self.width // times, self.height // times, self.near, self.limits)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None, **_: object) -> "Camera":
         """The camera with both matrices on ``device`` and in ``dtype``; the same object if they already are."""

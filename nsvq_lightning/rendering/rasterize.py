@@ -55,7 +55,7 @@ def render(
     """Render splats as a camera sees them (3D Gaussian Splatting, eq. 3), differentiable in all six raw attributes.
 
     Args:
-        splats: Raw attributes, see :class:`nsvq_lightning.splats.splats.SplatTensors` for shapes and spaces. Those of a
+        splats: Raw attributes, see :class:`nsvq_lightning.splats.splats.RawSplats` for shapes and spaces. Those of a
             module are in coordinates of its training: it renders them itself, ``module(camera)``.
         camera: Where to look from; COLMAP axes.
         sh_degree: Highest degree of the spherical harmonics that is evaluated; all stored ones by default.

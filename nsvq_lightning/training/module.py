@@ -37,7 +37,7 @@ from nsvq_lightning.training.self_check import check_device
 from nsvq_lightning.training.splat_scene import SplatScene
 from nsvq_lightning.training.stopwatch import Stopwatch
 
-# A term of the loss ``[]``, from the rendering of a train view and the view.
+# A term of the loss ``[]``, from the rendering of a train view and the view, whose photo is uint8.
 LossTerm = Callable[[Render, View], Tensor]
 
 # What may be behind the splats.
@@ -281,6 +281,7 @@ class SplatModule(LightningModule):
     def on_train_start(self) -> None:
         """Set Adam's numbers of this run, not those of a checkpoint; start measuring the training time."""
         check_device(self.device)
+        self.train()  # quantizers, whatever was rendered before
         self.splats.edits += 1  # they are the caller's no more
         views = self.trainer.world_size * self.trainer.accumulate_grad_batches
         optim.check_groups(self.trainer.optimizers, self.quantizers)
@@ -339,8 +340,9 @@ class SplatModule(LightningModule):
             self.zero_grad()
 
     def on_train_end(self) -> None:
-        """Stop measuring the training time."""
+        """Stop measuring the training time; what is rendered from here on is what a file would hold."""
         self.stopwatch.stop()
+        self.eval()
 
     def _start_evaluation(self) -> None:
         if len(self.splats) == 0:

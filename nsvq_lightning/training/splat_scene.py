@@ -74,7 +74,8 @@ class SplatScene:
             "antialiased": self.antialiased,
             "backend": self.backend,
         }
-        return render(splats, self.frame.camera(camera), **(own | options))
+        found = render(splats, self.frame.camera(camera), **(own | options))
+        return found._replace(depth=self.frame.unit * found.depth)  # in units of the files, too
 
     def compressed(self, phase: Phase, settings: Mapping[str, Any]) -> CompressedScene:
         """The scene as it is stored: frozen or nearest codes, codebooks, positions, opacities and the settings.

@@ -11,7 +11,7 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor, nn
 
-from nsvq_lightning.callbacks import PhaseSchedule
+from nsvq_lightning.callbacks import CodebookInit, PhaseSchedule
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io import load, save
@@ -231,6 +231,21 @@ def test_splats_of_another_precision_are_trained_in_float32() -> None:
     splats = SplatModule(codebooks=None, splats=make_splats().double()).splats
     assert {parameter.dtype for parameter in splats.parameters()} == {torch.float32}
     assert torch.equal(splats.means, make_splats().means)
+
+
+def test_a_module_renders_what_its_file_holds_once_it_was_trained(demo_scene: Path) -> None:
+    phases = PhaseSchedule(total=12, reference_total=None, warmup_end=2, prune_end=4, quantize_end=11, min_finetune=1)
+    trainer = SplatTrainer(max_steps=8, callbacks=[phases, CodebookInit()], enable_checkpointing=False, logger=False)
+    module = SplatModule(codebooks={"sh0": 4}, quantizer=NSVQ)
+    module.eval()  # as after a look at it
+    trainer.fit(module, ColmapDataModule(demo_scene, factor=2))
+    assert not module.training
+    view = trainer.datamodule.scene.view(0)  # type: ignore[attr-defined]
+    found = module(view.camera)
+    stored = module.compressed()
+    expected = render(stored.decode(), view.camera, background=stored.background)
+    torch.testing.assert_close(found.image, expected.image, atol=2e-3, rtol=0)
+    torch.testing.assert_close(found.depth, expected.depth, atol=1e-2, rtol=1e-3)
 
 
 def test_a_module_made_double_is_refused_at_once(demo_scene: Path) -> None:
