@@ -80,8 +80,6 @@ def run(options: Namespace) -> int:
     runs = plan(options)
     output.mkdir(parents=True, exist_ok=True)
     hold(output)
-    # What a job scheduler sends ends the training that is on, too; it would go on alone otherwise.
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         if options.commands:
             for command in commands(runs):
@@ -92,7 +90,6 @@ def run(options: Namespace) -> int:
         sys.stderr.write("nsvq sweep: interrupted; the same command goes on where it stopped\n")
         raise
     finally:
-        signal.signal(signal.SIGTERM, before)
         let_go(output)
     sys.stdout.write((output / "results.md").read_text(encoding="utf-8"))
     return int(any(row["error"] for row in rows))
@@ -140,7 +137,8 @@ def plan(options: Namespace) -> list[Run]:
     log.info("planning the runs takes half a second for each")
     common = [*options.further, "--trainer.logger=false"]
     if steps := options.max_steps:
-        common += [f"--trainer.max_steps={steps}", "--callbacks.phases.iterations_per_photo=null"]
+        lengths = map("--callbacks.phases.{}=null".format, ("iterations_per_photo", "minutes"))
+        common += [f"--trainer.max_steps={steps}", *lengths]
     runs: list[Run] = []
     for config in options.configs:
         arguments = [*_given({"config": config}), *common]
