@@ -97,7 +97,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     ``fit --ckpt_path …/last.ckpt`` continues exactly where it was saved. Lightning calls checkpoint callbacks after all
     others, so a checkpoint holds the finished step. Saving does not count as training time. Files are written
     atomically: the previous one stays until the new one is complete. If one cannot be written, as on a full disk, a run
-    of one process warns and goes on; if it is the last one, the run fails once its scene is written.
+    of one process warns and goes on; if it is the last one, the run fails at its very end.
 
     Ctrl-C and SIGTERM stop the run after the current iteration, with a checkpoint of it; a second one stops it at once.
     Several processes stop together after the iteration in which any of them receives a signal. After an exception,
@@ -112,7 +112,7 @@ class RunCheckpoint(WritingCallback, Checkpoint):
         [10000, 15000, 20000, 30000, 40000, 43000, 45000]
     """
 
-    passing = ("best_model_path", "_saved")
+    passing = ("best_model_path", "_missing", "_saved")
 
     every: Whole | None = None
     """Iterations between two checkpoints; None is a tenth of the schedule, 0 saves only at the end of the run."""

@@ -33,9 +33,10 @@ def notify_monitors(trainer: Trainer, module: SplatModule) -> None:
     these hooks. Here the sampler is endless and no validation runs, so neither ever comes. Where validation is asked
     for, it calls those of ``val/…`` itself.
     """
+    validates = trainer.enable_validation and trainer.val_check_interval != 1  # that of an epoch never comes
     for watcher in trainer.callbacks:  # type: ignore[attr-defined]  # Lightning does not type it
         monitor = getattr(watcher, "monitor", None)
-        if not isinstance(monitor, str) or (monitor.startswith("val/") and trainer.enable_validation):
+        if not isinstance(monitor, str) or (monitor.startswith("val/") and validates):
             continue
         if monitor in trainer.callback_metrics or not monitor.startswith("train/"):
             watcher.on_train_epoch_end(trainer, module)
@@ -112,7 +113,9 @@ class MetricReport(WritingCallback):
         loader = trainer.datamodule.val_dataloader()  # type: ignore[attr-defined]  # Lightning does not type it
         views = map(trainer.strategy.batch_to_device, loader)  # as training and validation have them
         with module.stopwatch.paused(module.device), self._beside.timed("evaluations"):
+            trainer.validating = True  # for hooks that change photos in training alone
             self._evaluate(trainer, module, iteration, views)
+            trainer.training = True
             notify_monitors(trainer, module)
 
     # The end of the run: before Lightning's own work at the end of its only epoch; where no epoch has ended; and of one

@@ -281,7 +281,7 @@ def check_overlap(model: "ColmapModel") -> Findings:
 
 def check_scene(root: Path, model: "ColmapModel") -> Findings:
     """Load the folder as a run does it, then check its split, its photos and their shape, and what a run will take."""
-    from nsvq_lightning.data.images import same_shape
+    from nsvq_lightning.data.images import is_cut
     from nsvq_lightning.data.points import in_picture
     from nsvq_lightning.data.scene import ONE_PLACE, OTHER_SHAPE, load_scene, spread
 
@@ -303,7 +303,7 @@ def check_scene(root: Path, model: "ColmapModel") -> Findings:
             yield Finding("problem", "poses", f"{text}: are poses camera to world, or quaternions xyzw?")
     cameras = [model.cameras[image.camera_id] for image in model.images]
     pairs = zip(cameras, scene.images.sources, strict=True)
-    if others := sum(not same_shape(source.size, (camera.width, camera.height)) for camera, source in pairs):
+    if others := sum(is_cut(source.size, (camera.width, camera.height)) for camera, source in pairs):
         yield Finding("problem", "sizes", f"{others} of {len(scene)} files {OTHER_SHAPE}")
     yield from attempt("photos", check_photos(scene, model))
     yield from attempt("run time", check_budget(scene))

@@ -253,10 +253,12 @@ class Compressor:
         if 8 * target >= ON_BASIS * splats or not self.scene.sh_degree:
             plain = Setting(splats, "none", self.scene.sh_degree > 0)
             exact = self.at(plain._replace(on_basis=False))
-            tried = [each for each in (exact, self._fitting(plain, target)) if each and len(each.data) <= target]
-            # Faint harmonics have finer steps on a basis.
-            fits = min(tried, key=lambda each: self.error(each) * (1 + SLACK * each.setting.on_basis), default=None)
-            if fits and (self.stopped or (exact in tried and self._is_own)):
+            is_exact = len(exact.data) <= target
+            fits = exact if is_exact else self._fitting(plain, target)
+            if is_exact and plain.on_basis and not self.stopped and (other := self._fitting(plain, target)):
+                # Faint harmonics have finer steps on a basis.
+                fits = other if self.error(other) < (1 - SLACK) * self.error(exact) else exact
+            if fits and (self.stopped or (is_exact and self._is_own)):
                 return fits
         coded = self._finest_coded(target, splats, not fits)
         if fits and coded:
@@ -322,7 +324,8 @@ class Compressor:
                 first = middle
                 found.append(candidate)
         if not found:
-            least = min((plain, self.at(settings[0])), key=self.error)
+            finest = self.at(settings[0]) if settings[0].on_basis else plain
+            least = min((plain, finest), key=self.error)
             raise ValueError(
                 f"no setting has an error of at most {error:g}: the most exact one has {self.error(least):.3g} in "
                 f"{len(least.data)} bytes; allow more, or use level 'paper' without codebooks, which loses nothing"

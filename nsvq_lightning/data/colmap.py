@@ -213,6 +213,8 @@ def model_files(root: Path, chosen: str | None = None) -> dict[str, Path]:
     if chosen is not None:
         folders = [f"sparse/{chosen}" if chosen.isdecimal() else chosen]
     if files := find_model(root, folders):
+        if chosen is None and files["images"].parent == root / "sparse" and _tables_in(root / "sparse" / "0"):
+            log.info(f"{root}: the COLMAP model is the one in sparse, not that in sparse/0 (--data.model=0)")
         return files
     others = other_models(root) if chosen is None else []
     if not others:

@@ -195,7 +195,7 @@ class ColmapDataModule(SceneDataModule):
         seed: Seed of the order of the train views.
         cache_bytes: Bytes for decoded images; what does not fit is decoded anew.
         images_folder: Name of the image folder.
-        model: What to read instead of ``sparse/0``: a number, a folder or a ``.json``.
+        model: What to read instead of ``sparse`` or ``sparse/0``: a number, a folder or a ``.json``.
         masks: Name of the folder of masks; None ignores them.
         allow_outside: Also read photos and masks that the model names outside ``root``.
     """

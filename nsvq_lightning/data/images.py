@@ -69,13 +69,16 @@ def image_head(path: Path) -> ImageHead:
 ROUNDED = 0.01
 
 
-def same_shape(one: Size, other: Size) -> bool:
-    """Whether two sizes (width, height) have one aspect ratio, up to rounding of a side to a pixel of the first.
+def is_cut(one: Size, other: Size) -> bool:
+    """Whether a photo of size (width, height) ``one`` shows another part than its camera of size ``other``.
 
     Those that differ little were not scaled, but cut, as photos without their distortion are.
     """
-    if ROUNDED * other[0] + 2 < abs(one[0] - other[0]) < 0.12 * other[0]:
-        return False
+    return not same_shape(one, other) or ROUNDED * other[0] + 2 < abs(one[0] - other[0]) < 0.12 * other[0]
+
+
+def same_shape(one: Size, other: Size) -> bool:
+    """Whether two sizes (width, height) have one aspect ratio, up to rounding of a side to a pixel of the first."""
     return abs(one[0] * other[1] - one[1] * other[0]) < max(ROUNDED * one[1] * other[0], *other)
 
 

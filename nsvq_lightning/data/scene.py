@@ -21,7 +21,7 @@ from tqdm import tqdm
 from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.compute.environment import usable_cores
 from nsvq_lightning.data.colmap import ColmapImage, ColmapModel, NoPhotosError, Pinhole, SceneError, larger_models
-from nsvq_lightning.data.images import ImageSource, ImageStore, Picture, head_for, high_pass, is_transparent, same_shape
+from nsvq_lightning.data.images import ImageSource, ImageStore, Picture, head_for, high_pass, is_cut, is_transparent
 from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder
 from nsvq_lightning.data.points import in_picture, projected, random_points
 from nsvq_lightning.data.transforms import read_poses
@@ -251,7 +251,7 @@ def load_scene(
 ) -> Scene:
     """Load a scene: photos, and the cameras of a COLMAP model (binary or text) or of a transforms file.
 
-    The model is in ``sparse/0``, ``sparse`` or the folder itself; if there is none, ``transforms.json`` (nerfstudio,
+    The model is in ``sparse``, ``sparse/0`` or the folder itself; if there is none, ``transforms.json`` (nerfstudio,
     instant-ngp, Polycam) or ``transforms_train.json`` and ``transforms_test.json`` (NeRF-synthetic) take its place.
     They say where the photos are. Without these, the only COLMAP model anywhere in the folder is read. A folder without
     points gets random ones. Photos that cannot be read are left out, with a warning.
@@ -380,8 +380,8 @@ def _in_front_of_white(images: ImageStore) -> bool:
 
 
 OTHER_SHAPE = (
-    "have another aspect ratio than their camera: they were cropped, rotated, undistorted or mixed up after COLMAP "
-    "ran; copy the photos it ran on, or the model of these"
+    "have another aspect ratio than their camera: they were cropped, rotated, undistorted (a few percent smaller or "
+    "larger) or mixed up after COLMAP ran; copy the photos it ran on, or the model of these"
 )
 
 
@@ -403,7 +403,7 @@ def _image_sources(
         log.info(f"{turned} of {len(heads)} photos are turned by their EXIF orientation, as their cameras are")
     elif lying := sum(head_for(path, size[::-1], as_shown=True).orientation != 1 for path, size in sized):
         log.warning(f"{lying} photos are stored on their side, so the scene is: nsvq prepare turns what is elsewhere")
-    if others := sum(not same_shape(head.size, size) for head, (_, size) in zip(heads, sized, strict=True)):
+    if others := sum(is_cut(head.size, size) for head, (_, size) in zip(heads, sized, strict=True)):
         log.warning(f"{others} of {len(heads)} photos {OTHER_SHAPE}")
     kinds = [(image.camera_id, head.size) for image, head in zip(model.images, heads, strict=True)]
     keep_maps = len(set(kinds)) <= MAX_CAMERAS_WITH_MAPS

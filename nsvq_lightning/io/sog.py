@@ -73,9 +73,6 @@ def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
     wide = scene.means.astype(np.float64)
     logs = np.copysign(np.log1p(np.abs(wide)), wide)
     low, high = logs.min(0), logs.max(0)
-    steps = (high - low) / 65535 * (1 + np.abs(wide))
-    if np.median(steps.max(1)) > np.exp(np.median(scene.rows("scales"))):
-        log.warning("positions of .sog are rounded by half a splat, as they are far from 0: .spz keeps them")
     halves = _low_and_high(np.rint(65535 * ((logs - low) / np.where(high > low, high - low, 1))))
     scales, scale_levels = _leveled(scene.rows("scales"))
     colors, color_levels = _leveled(scene.rows("sh0"))
@@ -132,6 +129,10 @@ def write_sog(path: StrPath, scene: CompressedScene, *, palette: int = PALETTE_L
     Raises:
         ValueError: The palette has no rows or more than 65536.
     """
+    wide = np.abs(scene.means)
+    steps = np.ptp(np.copysign(np.log1p(wide), scene.means), axis=0) / 65535 * (1 + wide)
+    if np.median(steps.max(1)) > np.exp(np.median(scene.rows("scales"))):
+        log.warning(f"{path}: positions are rounded by half a splat, as they are far from 0: .spz keeps them")
     contents = sog_contents(scene.in_morton_order(), palette)
     with atomic_write(path) as file:
         with ZipFile(file, "w") as archive:

@@ -116,7 +116,7 @@ def _rows(text: str, name: str, width: int) -> Float32s:
     for each in (name, f"{name}h"):
         value = r"(?:=|\.timeSamples\s*=\s*\{[^:\[]*:)\s*\[([^\]]*)\]"
         if found := re.search(rf"\[\]\s*{each}\s*{value}", text):
-            numbers = re.sub(r"[(),]", " ", found[1])
+            numbers = re.sub(r"[(),]", " ", found[1]).strip()
             with as_defect(f"damaged: {name}", (ValueError, DeprecationWarning)), catch_warnings(action="error"):
                 return np.fromstring(numbers, np.float32, sep=" ").reshape(-1, width)
     raise FormatError(f"truncated: {name} has no end" if name in text else f"no attribute {name}")

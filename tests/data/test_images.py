@@ -23,6 +23,7 @@ from nsvq_lightning.data.images import (
     edges_of,
     head_for,
     image_head,
+    is_cut,
     read_image,
     read_mask,
     same_shape,
@@ -251,6 +252,14 @@ def test_masks_of_any_kind(tmp_path: Path, picture: PIL.Image.Image) -> None:
 def test_shapes_are_compared_up_to_a_pixel(size: tuple[int, int], expected: bool) -> None:
     assert same_shape(size, (194, 130)) is expected
     assert same_shape((99, 100), (100, 99)) is False
+    assert is_cut(size, (194, 130)) is not expected
+
+
+def test_sizes_that_differ_little_were_cut() -> None:
+    assert is_cut((371, 278), (400, 300))
+    assert not is_cut((200, 150), (400, 300))
+    assert not is_cut((398, 299), (400, 300))
+    assert same_shape((371, 278), (400, 300))  # of a mask, or a photo on its side
 
 
 def test_downscaling_averages_areas(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_a_scene_too_wide_for_its_steps_is_told(tmp_path: Path, caplog: pytest.L
     near.means[:500, 0] += 4000
     near.scales[:] -= 3
     save(near, tmp_path / "wide.sog")
-    assert "positions of .sog are rounded by half a splat" in caplog.text
+    assert "wide.sog: positions are rounded by half a splat" in caplog.text
 
 
 @pytest.mark.parametrize("bands", range(4))
