@@ -171,10 +171,15 @@ class Compressor:
             shortest = self._splats.scales.amax(1, keepdim=True) - THINNEST
             self._splats = self._splats._replace(scales=self._splats.scales.maximum(shortest))
         self._render = renderer(self.scene)
+        if self.photos:
+            self.photos = usable(self.photos)
+        # Those of the photos, where the cameras are theirs.
+        views = self.photos.train if self.photos and not self.cameras else ()
         self._known = self.photos.train_cameras if self.photos else self.cameras
         cameras = self.cameras or self._known or viewpoints.square_views(self._splats, viewpoints.VIEWS)
         # Of a walk, few show each place. All pictures are held.
-        self.cameras = spread(cameras, min(max(viewpoints.VIEWS, len(cameras) // 4), 4 * viewpoints.VIEWS))
+        most = min(max(viewpoints.VIEWS, len(cameras) // 4), 4 * viewpoints.VIEWS)
+        self.cameras, self._views = spread(cameras, most), spread(views, most)
         self._is_own = self.photos is None or self.photos.split == viewpoints.OWN
         if not self._is_own and (likeness := self.quality(self._splats)) < MIN_PSNR:
             raise ValueError(
@@ -186,14 +191,15 @@ class Compressor:
 
     @cached_property
     def measure(self) -> viewpoints.Measure:
-        """Measures errors."""
-        return viewpoints.Measure(self._splats, self.cameras, self._render)
+        """Measures errors, of photos where these count."""
+        masks = [self.data.scene.images[view].mask for view in spread(self._views, viewpoints.MEASURED)]
+        return viewpoints.Measure(self._splats, self.cameras, self._render, masks)
 
     @cached_property
     def data(self) -> SceneDataModule:
         """The views to train on."""
         scene = self.photos or viewpoints.own_scene(self._splats, self.cameras, self._render)
-        return SceneDataModule(usable(scene), self.seed)
+        return SceneDataModule(scene, self.seed)
 
     def best(self, splats: int, codebooks: str | None, target_bytes: int | None, max_error: float | None) -> Candidate:
         """The smallest file with an error, the best one of a size, or that with these codebooks; the first asked for.

@@ -64,13 +64,21 @@ class Measure:
         original: Raw attributes.
         cameras: Views, some of which are taken.
         look: How they are rendered.
+        masks: Which pixels ``[H, W]`` of each count; None, or no masks at all, where all do.
 
     Raises:
         ValueError: No camera shows any splat.
     """
 
-    def __init__(self, original: SplatTensors, cameras: Sequence[Camera], look: Renderer = render) -> None:
+    def __init__(
+        self,
+        original: SplatTensors,
+        cameras: Sequence[Camera],
+        look: Renderer = render,
+        masks: Sequence[Tensor | None] = (),
+    ) -> None:
         self.cameras = spread(cameras, MEASURED)
+        self._masks = spread(masks, MEASURED) or [None] * len(self.cameras)
         self._look = look
         self._expected = list(pictures(original, self.cameras, look))
         if all(torch.equal(picture, picture[:1, :1].expand_as(picture)) for picture in self._expected):
@@ -81,8 +89,8 @@ class Measure:
 
     def error(self, splats: SplatTensors) -> float:
         """Root mean square difference for channels in [0, 1]."""
-        found = pictures(splats, self.cameras, self._look)
-        squares = [float((a - b).double().square().mean()) for a, b in zip(found, self._expected, strict=True)]
+        pairs = zip(pictures(splats, self.cameras, self._look), self._expected, self._masks, strict=True)
+        squares = [float((a - b)[... if mask is None else mask].double().square().mean()) for a, b, mask in pairs]
         return math.sqrt(np.mean(squares))
 
     def told(self, error: float, original: str) -> str:

@@ -18,7 +18,8 @@ from splat_scenes import ball
 import nsvq_lightning as nl
 from nsvq_lightning.callbacks.forecast import grown
 from nsvq_lightning.compression.compressor import SLACK, THINNEST, Compressor, Setting, setting_for
-from nsvq_lightning.compression.viewpoints import Measure, own_scene, pictures
+from nsvq_lightning.compression.viewpoints import MEASURED, Measure, own_scene, pictures
+from nsvq_lightning.data.images import ImageStore, Picture
 from nsvq_lightning.data.scene import Scene, load_scene
 from nsvq_lightning.io import CompressedScene
 from nsvq_lightning.io.nsvq.file import decode
@@ -66,6 +67,26 @@ def test_a_photo_that_is_damaged_is_left_out(make_scene: Callable[..., Path]) ->
     data = Compressor(ball(60), scene.train_cameras, scene, steps=4).data
     assert 4 in scene.train
     assert 4 not in data.scene.train
+
+
+def test_errors_are_of_pixels_that_count() -> None:
+    scene = ball(200)
+    splats, cameras = scene.decode(), cameras_around(scene.means, 30, 80, 60)
+    own = own_scene(splats, cameras)
+    masks = []
+    for view in range(len(own)):
+        mask = torch.zeros(60, 80, dtype=torch.bool)
+        mask[:, view:] = True  # another one for each photo
+        masks.append(mask)
+    held = [Picture(own.images[view].image, mask) for view, mask in enumerate(masks)]
+    photos = replace(own, images=ImageStore((), held=held), split="of a folder")
+    masked = Compressor(scene, photos=photos, steps=4)
+    candidate = masked.at(Setting(200, "0.5k"))
+    squares = []
+    for view in photos.train[:: -(-len(photos.train) // MEASURED)]:
+        pair = [next(pictures(each, [cameras[view]])) for each in (scene.tensors(), candidate.scene.tensors())]
+        squares.append(float((pair[0] - pair[1])[masks[view]].double().square().mean()))
+    assert masked.error(candidate) == pytest.approx(np.mean(squares) ** 0.5, rel=1e-6)
 
 
 def test_fewer_splats_are_those_that_show(small: Compressor) -> None:
