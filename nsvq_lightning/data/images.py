@@ -31,6 +31,8 @@ Image.MAX_IMAGE_PIXELS = 1 << 27
 DAMAGED = (OSError, ValueError, SyntaxError, KeyError, TypeError, struct.error, Image.DecompressionBombError)
 # EXIF orientations from here on: stored lying on its side, so that programs that apply it swap width and height.
 ON_ITS_SIDE = 5
+# Relative difference of aspect ratios that rounding explains.
+ROUNDED = 0.01
 
 
 # Width and height in pixels.
@@ -63,10 +65,6 @@ def image_head(path: Path) -> ImageHead:
     except DAMAGED as error:
         raise _undecodable(path, str(error)) from error
     return ImageHead(size, orientation, has_alpha)
-
-
-# Relative difference of aspect ratios that rounding explains.
-ROUNDED = 0.01
 
 
 def is_cut(one: Size, other: Size) -> bool:
