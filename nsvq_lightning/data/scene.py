@@ -169,7 +169,7 @@ class Scene:
         train: Indices of the train views, ascending.
         test: Indices of the test views, ascending.
         extent: Of the cameras, scene units (:meth:`nsvq_lightning.rendering.frame.Frame.around`); 0 in one place.
-        frame: Coordinates that it is trained in.
+        frame: Coordinates that it is trained in; those of the cameras by default, of an extent of about 5.
         split: Which views are the test views, in words.
         white: Whether the photos show objects in front of white, as those of NeRF-synthetic scenes do.
         grey: Whether the points have no colours: random ones, as there are none of SfM, or those of a program that does
