@@ -213,8 +213,8 @@ def find_masks(
     return given
 
 
-# What masks are called beside the stem of their photo, which may have been converted since.
-_MASK_NAMES = ("{}_mask", "{}.mask", "mask_{}", "{}.heic", "{}.webp", "{}.avif")
+# What masks are called beside the stem of their photo, which may have been converted from a kind that is not in PHOTOS.
+_MASK_NAMES = ("{}_mask", "{}.mask", "mask_{}", "{}.heic", "{}.heif", "{}.avif")
 
 
 def masks_in(folder: Path, named: Sequence[tuple[str, str]], photos: Sequence[Path], beside: bool) -> list[Path | None]:

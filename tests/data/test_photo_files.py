@@ -136,6 +136,20 @@ def test_masks_are_found_in_the_only_place_that_has_some(
     assert masks_of(tmp_path, "more_masks", "1.jpg", "2.jpg") == [None, tmp_path / "more_masks/2.png"]
 
 
+@pytest.mark.parametrize("other", ["png", "webp", "tif"])
+def test_a_photo_of_another_kind_and_the_same_name_is_no_mask(tmp_path: Path, other: str) -> None:
+    write(tmp_path, "images/1.jpg", f"images/1.{other}")
+    assert masks_of(tmp_path, "masks", "1.jpg") == [None]
+
+
+def test_a_mask_of_what_a_photo_was_converted_from_is_its_own(tmp_path: Path) -> None:
+    write(tmp_path, "images/1.jpg", "images/2.jpg", "masks/1.HEIC.png", "masks/2.avif.png")
+    assert masks_of(tmp_path, "masks", "1.jpg", "2.jpg") == [
+        tmp_path / "masks/1.HEIC.png",
+        tmp_path / "masks/2.avif.png",
+    ]
+
+
 def test_a_photo_is_no_mask(tmp_path: Path) -> None:
     write(tmp_path, "images/1.jpg", "images/mask_1.jpg", "images/2.jpg", "unmasked/1.jpg", "unmasked/3.jpg")
     photos = [ColmapImage(name, 1, np.eye(4)) for name in ("1.jpg", "mask_1.jpg", "2")]
