@@ -417,16 +417,17 @@ def _no_model(root: Path, folders: Sequence[str], chosen: str | None) -> SceneEr
 
 
 def larger_models(root: Path) -> str | None:
-    """Which models of a scene folder have more images than its ``sparse/0``, and what to do; None if there are none.
+    """Which models of a scene folder have more images than its ``sparse/0``, and what to do; None if none has.
 
-    COLMAP numbers the parts of a scene that it could not join, not always in the order of their size.
+    COLMAP numbers the parts of a scene that it could not join, not always in the order of their size. A model in
+    ``sparse`` itself, which is read before them, is no such part.
     """
     counts = {}
     for folder in (root / "sparse").glob("*"):
         if files := _tables_in(folder):
             with suppress(ValueError, OSError):
                 counts[folder.name] = len(tables.read_images(files["images"]))
-    first = counts.get("0", math.inf)
+    first = math.inf if _tables_in(root / "sparse") else counts.get("0", math.inf)
     larger = [f"sparse/{name} has {count}" for name, count in sorted(counts.items()) if count > first]
     advice = "COLMAP could not join them; --data.model=N trains on sparse/N"
     return f"sparse/0 has {first} images, {', '.join(larger)}: {advice}" if larger else None

@@ -68,7 +68,7 @@ def has_poses(root: Path) -> bool:
 
 
 def _files_in(root: Path) -> list[Path]:
-    """The transforms file of a folder, or that of the train views and the one of the test views; maybe none."""
+    """The transforms files of a folder: of train and of test views, or else the one of all; maybe none."""
     single, *parts = (root / f"transforms{part}.json" for part in ("", "_train", "_test", "_val"))
     found = [path for path in parts if path.is_file()][:2] if parts[0].is_file() else []
     return [single] if single.is_file() and len(found) < 2 else found

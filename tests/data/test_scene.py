@@ -161,6 +161,8 @@ def test_a_model_in_sparse_itself_is_the_later_one(make_scene: SceneFactory) -> 
         shutil.copy(path, root / "sparse")
     assert len(load_scene(root)) == 5
     assert len(load_scene(root, model="0")) == 9
+    shutil.copytree(make_scene("more", views=10) / "sparse/0", root / "sparse/1")
+    assert larger_models(root) is None  # than a model that is not read
 
 
 def test_a_larger_model_beside_the_first_is_named(make_scene: SceneFactory, caplog: pytest.LogCaptureFixture) -> None:
