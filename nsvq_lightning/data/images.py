@@ -47,6 +47,11 @@ class ImageHead(NamedTuple):
     has_alpha: bool
 
 
+def exif_of(image: Image.Image) -> Image.Exif:
+    """The EXIF tags of an open image; Pillow would decode a whole PNG for those behind its pixels, which few have."""
+    return Image.Exif() if image.format == "PNG" and "exif" not in image.info else image.getexif()
+
+
 def image_head(path: Path) -> ImageHead:
     """What the head of an image file says.
 
@@ -56,8 +61,7 @@ def image_head(path: Path) -> ImageHead:
     try:
         with Image.open(path) as image:
             size = image.size
-            # Pillow decodes a whole PNG to look for tags behind its pixels, where hardly any has them.
-            tags = {} if image.format == "PNG" and "exif" not in image.info else image.getexif()
+            tags = exif_of(image)
             orientation = int(tags.get(Base.Orientation, 1))
             if image.format == "TIFF":  # Pillow applies the orientation to their size
                 size = int(tags[Base.ImageWidth]), int(tags[Base.ImageLength])

@@ -25,7 +25,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
-from nsvq_lightning.data.images import DAMAGED, ImageHead, read_image, read_mask, write_pixels
+from nsvq_lightning.data.images import DAMAGED, ImageHead, exif_of, read_image, read_mask, write_pixels
 from nsvq_lightning.data.photo_files import PHOTOS, masks_in, photos_below
 from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
 from nsvq_lightning.top_level import log
@@ -176,7 +176,7 @@ def _extract(scene: Path, photos: Heads, report: Report, max_size: int, threads:
     for name, head in photos.items():
         path = images / name
         groups[path.parent, head.size, _lens_of(path)].append(name)
-    kept = TemporaryDirectory()  # it goes with this function
+    kept = TemporaryDirectory()
     masks = _write_masks(scene, photos, Path(kept.name))
     stamps = {}
     for group in groups.values():
@@ -209,6 +209,7 @@ def _extract(scene: Path, photos: Heads, report: Report, max_size: int, threads:
             )
             done += len(batch)
             report("finding features", done, len(photos))
+    kept.cleanup()  # which an error leaves to the end of this object
     return stamps
 
 
@@ -232,8 +233,7 @@ def _lens_of(path: Path) -> str:
     """What EXIF says of the camera and the lens of a photo."""
     tags, how = Image.Exif(), {}
     with Image.open(path) as image, suppress(*DAMAGED):
-        if image.format != "PNG" or "exif" in image.info:  # Pillow decodes a whole PNG to look for it elsewhere
-            tags = image.getexif()
+        tags = exif_of(image)
         how = tags.get_ifd(IFD.Exif)
     zoom = how.get(Base.DigitalZoomRatio)
     lens = [tags.get(Base.Model), how.get(Base.FocalLength), how.get(Base.FocalLengthIn35mmFilm)]
