@@ -226,7 +226,8 @@ class BudgetedGrowth(Densification):
         module.pixel_weights = None
         if growing:
             scene = run_scene.scene_of(module.trainer)
-            edges = edges_of(batch.smaller(1).image, batch.mask) if scene is None else scene.images.edges(batch.index)
+            view = batch.smaller(1) if batch.image.is_floating_point() else batch  # in bytes
+            edges = edges_of(view.image, view.mask) if scene is None else scene.images.edges(batch.index)
             module.pixel_weights = edges.strength(batch.image.device)
         return growing
 
