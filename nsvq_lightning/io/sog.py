@@ -70,8 +70,7 @@ def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
 
     if not 1 <= palette <= PALETTE_LIMIT:
         raise ValueError(f"palette must be in 1..{PALETTE_LIMIT}, got {palette}")
-    wide = scene.means.astype(np.float64)
-    logs = np.copysign(np.log1p(np.abs(wide)), wide)
+    logs = _signed_logs(scene.means)
     low, high = logs.min(0), logs.max(0)
     halves = _low_and_high(np.rint(65535 * ((logs - low) / np.where(high > low, high - low, 1))))
     scales, scale_levels = _leveled(scene.rows("scales"))
@@ -115,6 +114,12 @@ def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
     return contents
 
 
+def _signed_logs(means: Float32s) -> Float64s:
+    """What is stored of positions, in even steps: ±ln(1 + abs(x))."""
+    wide = means.astype(np.float64)
+    return np.copysign(np.log1p(np.abs(wide)), wide)
+
+
 def write_sog(path: StrPath, scene: CompressedScene, *, palette: int = PALETTE_LIMIT) -> int:
     """Write a scene as ``.sog``, in Morton order.
 
@@ -129,8 +134,7 @@ def write_sog(path: StrPath, scene: CompressedScene, *, palette: int = PALETTE_L
     Raises:
         ValueError: The palette has no rows or more than 65536.
     """
-    wide = np.abs(scene.means)
-    steps = np.ptp(np.copysign(np.log1p(wide), scene.means), axis=0) / 65535 * (1 + wide)
+    steps = np.ptp(_signed_logs(scene.means), axis=0) / 65535 * (1 + np.abs(scene.means))
     if np.median(steps.max(1)) > np.exp(np.median(scene.rows("scales"))):
         log.warning(f"{path}: positions are rounded by half a splat, as they are far from 0: .spz keeps them")
     contents = sog_contents(scene.in_morton_order(), palette)
