@@ -208,8 +208,8 @@ class MetricReport(WritingCallback):
         scores = sorted(scores, key=lambda score: score["name"])
         if trainer.is_global_zero and scores:
             folder = run_folder(trainer)
-            path, reason = folder / "scene.nsvq", self._lpips_reason
-            metrics = numbers.summarize(path, self._scene, scores, reason, module, self._paper)
+            file, reason = folder / "scene.nsvq", self._lpips_reason
+            metrics = numbers.summarize(file, self._scene, scores, reason, module, self._paper)
             with optional(folder / "metrics.json") as path:
                 numbers.write_metrics(path, metrics)
             with optional(folder / "views.csv") as path:

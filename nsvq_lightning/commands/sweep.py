@@ -137,8 +137,8 @@ def plan(options: Namespace) -> list[Run]:
     log.info("planning the runs takes half a second for each")
     common = [*options.further, "--trainer.logger=false"]
     if steps := options.max_steps:
-        lengths = map("--callbacks.phases.{}=null".format, ("iterations_per_photo", "minutes"))
-        common += [f"--trainer.max_steps={steps}", *lengths]
+        others = [f"--callbacks.phases.{length}=null" for length in ("iterations_per_photo", "minutes")]
+        common += [f"--trainer.max_steps={steps}", *others]
     runs: list[Run] = []
     for config in options.configs:
         arguments = [*_given({"config": config}), *common]

@@ -198,8 +198,7 @@ class Compressor:
     @cached_property
     def data(self) -> SceneDataModule:
         """The views to train on."""
-        scene = self.photos or viewpoints.own_scene(self._splats, self.cameras, self._render)
-        return SceneDataModule(scene, self.seed)
+        return SceneDataModule(self.photos or viewpoints.own_scene(self._splats, self.cameras, self._render), self.seed)
 
     def best(self, splats: int, codebooks: str | None, target_bytes: int | None, max_error: float | None) -> Candidate:
         """The smallest file with an error, the best one of a size, or that with these codebooks; the first asked for.

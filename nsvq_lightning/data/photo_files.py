@@ -179,10 +179,10 @@ def find_masks(
         SceneError: A mask that the model names does not exist, or two files fit a photo.
     """
     given = [image.mask for image in images]
-    lost = {path: None for path in given if path and not path.is_file()}
+    lost = dict.fromkeys(path for path in given if path and not path.is_file())
     if lost and folders[-1] == "masks":
         raise SceneError(f"{len(lost)} masks do not exist, first {next(iter(lost))}: copy them, or remove mask_path")
-    given = [path and lost.get(path, path) for path in given]
+    given = [None if path in lost else path for path in given]
     relative = [str(path.relative_to(photos)) if path.is_relative_to(photos) else path.name for path in files]
     named = [(image.name, name) for image, name in zip(images, relative, strict=True)]
     has_own = any(given) and folders[-1] == "masks"  # another folder is meant in their place
