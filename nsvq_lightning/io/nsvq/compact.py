@@ -200,25 +200,14 @@ def _check_tables(header: Header) -> None:
             check_room(f"rows of {name}", entry.codes, lengths[name], FEW_ROWS, each=1)
 
 
-# Attributes that may be stored so.
-_STORED = {
-    "cells": ("means",),
-    "levels": ("opacities",),
-    "steps": QUANTIZABLE,
-    "codes": QUANTIZABLE,
-    "components": ("shN",),
-}
-
-
 def _possible(entry: AttributeEntry) -> bool:
-    if entry.name not in _STORED.get(entry.storage, ()):
-        return False
     if entry.storage == "levels":
-        return entry.step == 0 and 1 <= entry.codes <= MAX_OPACITY_LEVELS
+        return entry.name == "opacities" and entry.step == 0 and 1 <= entry.codes <= MAX_OPACITY_LEVELS
     if entry.storage == "codes":
-        return entry.step > 0 and entry.dim > 0 and 1 <= entry.codes <= 1 << 32
+        return entry.name in QUANTIZABLE and entry.step > 0 and entry.dim > 0 and 1 <= entry.codes <= 1 << 32
     if entry.storage == "components":
         # Float32 has all multiples of such a step below 2^23.
         power_of_two = math.frexp(entry.step)[0] == 0.5
-        return power_of_two and 2.0**-149 <= entry.step <= 1 and 1 <= entry.codes <= entry.dim
-    return entry.step > 0 and entry.codes == 0
+        return entry.name == "shN" and power_of_two and 2.0**-149 <= entry.step <= 1 and 1 <= entry.codes <= entry.dim
+    names = {"cells": ("means",), "steps": QUANTIZABLE}.get(entry.storage, ())
+    return entry.name in names and entry.step > 0 and entry.codes == 0
