@@ -28,14 +28,12 @@ X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, DEPTH, SLOPE_X, SLOPE_Y, SLOT, OR
 
 # Fields of a slot: with h = α·dL/dα, sums over pixels of w·g (colour), h, h·u, h·v, h·u², h·u·v, h·v², w·g (depth) and,
 # with absolute gradients, |h·u|, |B·h·u + C·h·v|, w·pixel weight.
-SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_DEPTH, ABS_X, ABS_Y, SUM_WEIGHT = range(
-    13
-)
+SUM_RED, SUM_GREEN, SUM_BLUE, SUM_H, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV = range(9)
+SUM_DEPTH, ABS_X, ABS_Y, SUM_WEIGHT = range(9, 13)
 
 # Elements of the camera array of `pack_camera`.
-ROTATION, TRANSLATION, POSITION, FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, WIDTH, HEIGHT, NEAR = (
-    0, 9, 12, *range(15, 26),
-)  # fmt: skip
+ROTATION, TRANSLATION, POSITION = 0, 9, 12
+FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, WIDTH, HEIGHT, NEAR = range(15, 26)
 # Largest image side in pixels: a record has 16 bits, one of them the sign, for a tile's column or row.
 MAX_SIDE = TILE * (2**15 - 1)
 
