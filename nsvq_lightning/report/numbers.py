@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.distributed
 from scipy import stats
 from torch import Tensor
 

@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 import torch
-import torch.distributed
 from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy, Strategy, StrategyRegistry
 from torch import Tensor, nn
