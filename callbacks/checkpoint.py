@@ -2,6 +2,7 @@
 
 import signal
 from contextlib import nullcontext
+from dataclasses import field
 from pathlib import Path
 from threading import current_thread, main_thread
 from typing import Any
@@ -120,12 +121,9 @@ class RunCheckpoint(WritingCallback, Checkpoint):
     """Also keep each checkpoint as ``step-<iteration>.ckpt``."""
     # Path of ``last_path`` under the name by which Lightning looks for ``ckpt_path="best"``.
     best_model_path = ""
+    _stop: GracefulStop = field(default_factory=GracefulStop, init=False)
     _saved = -1
     _missing = _training = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._stop = GracefulStop()
 
     @property
     def last_path(self) -> Path | None:

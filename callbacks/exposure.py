@@ -1,5 +1,6 @@
 """An option beyond the recipe: exposures of photos."""
 
+from dataclasses import field
 from typing import Any
 
 import torch
@@ -33,11 +34,9 @@ class ExposureCompensation(SplatCallback):
     final: Positive = 0.1
     """Its factor at the end; it falls exponentially."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._adam: torch.optim.Adam | None = None
-        self._loaded: dict[str, Any] | None = None
-        self._plain: LossTerm | None = None
+    _adam: torch.optim.Adam | None = field(default=None, init=False)
+    _loaded: dict[str, Any] | None = field(default=None, init=False)
+    _plain: LossTerm | None = field(default=None, init=False)
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Start from no change, or from what a checkpoint has.
