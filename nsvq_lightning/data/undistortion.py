@@ -66,8 +66,8 @@ class Undistortion:
             ) from error
         self._camera = camera
         self.size = (width, height)
-        self._scale = (width / camera.width, height / camera.height)
-        self.pinhole = Pinhole(ideal.calibration_matrix(), ideal.width, ideal.height).scaled(*self._scale)
+        pinhole = Pinhole(ideal.calibration_matrix(), ideal.width, ideal.height)
+        self.pinhole = pinhole.scaled(width / camera.width, height / camera.height)
         self._keep_maps = keep_maps
         self._maps: tuple[Float32s, Float32s, Bools] | None = None
         self._warned = False
@@ -80,7 +80,6 @@ class Undistortion:
         scale = pinhole.width / self.pinhole.width
         width, height = (max(1, round(scale * side)) for side in self.size)
         self.size = (width, height)
-        self._scale = (width / self._camera.width, height / self._camera.height)
         self.pinhole, self._maps = pinhole, None
 
     def __call__(self, image: Uint8s, kept: Bools | None = None) -> tuple[Uint8s, Bools | None]:
@@ -138,8 +137,8 @@ class Undistortion:
 
     def _source_pixels(self) -> Float32s:
         """Where each pixel of the pinhole image comes from ``[H, W, 2]``."""
-        K = self.pinhole.K
-        width, height = self.pinhole.width, self.pinhole.height
+        K, width, height = self.pinhole.K, self.pinhole.width, self.pinhole.height
+        scale = np.divide(self.size, (self._camera.width, self._camera.height))
         x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
         y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
         pixels = np.empty((height, width, 2), np.float32)
@@ -147,6 +146,6 @@ class Undistortion:
         for top in range(0, height, at_once):
             grid = np.meshgrid(x, y[top : top + at_once])
             rays = np.stack([*grid, np.ones_like(grid[0])], axis=-1).reshape(-1, 3)
-            block = np.asarray(self._camera.img_from_cam(rays)) * self._scale - 0.5
+            block = np.asarray(self._camera.img_from_cam(rays)) * scale - 0.5
             pixels[top : top + at_once] = block.reshape(-1, width, 2)
         return pixels
