@@ -6,11 +6,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import inline, parallel
 from nsvq_lightning.compute.memory import recycled
-from nsvq_lightning.compute.simd import get, put
+from nsvq_lightning.compute.simd import get, load, load_rows3, load_rows4, put, scratch
 
 
 @inline
@@ -32,7 +31,7 @@ def _loader(columns, load):
     @inline
     def load_rows(rows, start, count):
         if count < 16:
-            padded = simd.scratch(64)
+            padded = scratch(64)
             for k in range(columns * count):
                 put(padded, k, get(rows, columns * start + k))
             return load(padded, 0)
@@ -41,7 +40,7 @@ def _loader(columns, load):
     return load_rows
 
 
-load_numbers, load_vectors, load_quats = _loader(1, simd.load), _loader(3, simd.load_rows3), _loader(4, simd.load_rows4)
+load_numbers, load_vectors, load_quats = _loader(1, load), _loader(3, load_rows3), _loader(4, load_rows4)
 
 
 @inline
