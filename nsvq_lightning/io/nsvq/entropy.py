@@ -285,12 +285,6 @@ def _below(value, bits):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _second_context(start, length):  # type: ignore[no-untyped-def]
-    """Context of the bit after the leading one."""
-    return start + (1 << _LENGTH_BITS) + length
-
-
-@inline
 def _write_length(length, start, contexts, state, words):  # type: ignore[no-untyped-def]
     node = 1
     for left in range(_LENGTH_BITS - 1, -1, -1):
@@ -383,7 +377,7 @@ def _write_integers(values, order, modes, words, contexts):  # type: ignore[no-u
             state = rc.encode_plain(value < 0, min(length, 1), state, words)
             if length > 1:
                 second = int64(size >> uint64(length - 2)) & 1
-                context = _second_context(start, length)
+                context = start + (1 << _LENGTH_BITS) + length
                 state = rc.encode_bit(second, context, context, contexts, state, words)
                 state = rc.encode_plain(_below(size, length - 1), length - 2, state, words)
     return rc.encode_end(state, words)
@@ -399,7 +393,7 @@ def _read_integers(words, modes, values, contexts):  # type: ignore[no-untyped-d
             sign, state = rc.decode_plain(min(length, 1), state, words)
             size = uint64(min(length, 1))
             if length > 1:
-                context = _second_context(start, length)
+                context = start + (1 << _LENGTH_BITS) + length  # of the bit after the leading one
                 second, state = rc.decode_bit(context, context, contexts, state, words)
                 rest, state = rc.decode_plain(length - 2, state, words)
                 size = ((uint64(2) | uint64(second)) << uint64(length - 2)) | rest
