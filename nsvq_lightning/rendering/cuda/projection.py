@@ -1,7 +1,7 @@
 """Projection, spherical harmonics and their backward pass, one splat per lane."""
 
+from functools import lru_cache
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import torch
 import triton
@@ -177,19 +177,12 @@ class Lens(NamedTuple):
     height: int
 
     @classmethod
+    @lru_cache(4096)  # as many as a frame keeps
     def of(cls, camera: Camera, device: torch.device) -> "Lens":
         """Pack a camera; for one that has been packed for the device before, nothing is copied."""
-        lens = _lenses.get(camera, {}).get(device)
-        if lens is None:
-            numbers = [*camera.packed_view, *camera.slope_limits, camera.near]
-            view = to_device(torch.tensor(numbers, dtype=torch.float32), device)
-            lens = cls(view, *camera.intrinsics, *camera.size)
-            _lenses.setdefault(camera, {})[device] = lens
-        return lens
-
-
-# Packed cameras by device.
-_lenses: WeakKeyDictionary[Camera, dict[torch.device, Lens]] = WeakKeyDictionary()
+        numbers = [*camera.packed_view, *camera.slope_limits, camera.near]
+        view = to_device(torch.tensor(numbers, dtype=torch.float32), device)
+        return cls(view, *camera.intrinsics, *camera.size)
 
 
 class Projected(NamedTuple):
