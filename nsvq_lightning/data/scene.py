@@ -211,6 +211,15 @@ class Scene:
         """The scene with at most so many of its points, evenly taken."""
         return replace(self, points=spread(self.points, most), colors=spread(self.colors, most))
 
+    def covered(self) -> float:
+        """Mean share of 8 x 8 cells of train photos in which points lie."""
+        points, shares = spread(self.points, SOME_SPLATS).double().numpy(), []
+        for camera in spread(self.train_cameras, SOME_CAMERAS):
+            column, row, _ = projected(points, camera)
+            cells, *_ = np.histogram2d(column, row, 8, [[0, camera.width], [0, camera.height]])
+            shares.append((cells > 0).mean())
+        return float(np.mean(shares))
+
     def with_random_points(self) -> "Scene":
         """The scene with random points in place of its own."""
         points = torch.from_numpy(random_points(spread(self.train_cameras, SOME_CAMERAS))).float()

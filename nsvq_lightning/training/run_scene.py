@@ -19,15 +19,16 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT
-from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors
+from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, distinct_rows
 from nsvq_lightning.top_level import log
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.importance import contributions, sensitivity
 from nsvq_lightning.training.splat_scene import SplatScene
 
 # First splats of a run with a budget (docs/recipe.md): opacity; largest size in pixels of the nearest photo, as a lone
-# point would hide what is behind it; and most points of those that there are, as a multiple of those to start with.
-FIRST_OPACITY, MAX_PIXELS, MOST_POINTS = 0.3, 50.0, 8
+# point would hide what is behind it; most points of those that there are, as a multiple of those to start with; share
+# of the photos in which points must lie, as a scanner that reaches a few metres has many points there, and none behind.
+FIRST_OPACITY, MAX_PIXELS, MOST_POINTS, MIN_COVERED = 0.3, 50.0, 8, 0.75
 
 
 def scene_of(trainer: Trainer | None) -> Scene | None:
@@ -191,13 +192,16 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
     scene = needed_scene(trainer, "no splats to start from", "set init_from").standard
     if count is None:
         return Splats.from_points(scene.points, scene.colors, sh_degree)
-    scene = replace(scene, grey=scene.grey or len(scene.points) < FEW_POINTS)
+    scene = scene.thinned(MOST_POINTS * count or len(scene.points))
+    rows = distinct_rows(scene.points)  # meshes have a corner once for each of its triangles
+    grey = scene.grey or len(rows) < FEW_POINTS
+    scene = replace(scene, points=scene.points[rows], colors=scene.colors[rows], grey=grey)
     if any(source.masked for source in scene.images.sources):
         # What is always masked is not trained, only in the way.
-        scene = scene.thinned(MOST_POINTS * count or len(scene.points))
         shown = torch.from_numpy(colors_at(scene, scene.points.double().numpy(), 1)[1][:, 0] > 0)
         scene = replace(scene, points=scene.points[shown], colors=scene.colors[shown]) if shown.any() else scene
-    points, colors = _with_dense_points(scene, count, seed)
+    is_part = len(scene.points) > count // 2 and scene.covered() < MIN_COVERED
+    points, colors = _with_dense_points(scene, count, seed, least=count // 2 if is_part else 0)
     points, colors = (torch.cat(parts) for parts in zip((points, colors), far_points(scene, points), strict=True))
     splats = Splats.from_points(points, colors, sh_degree, FIRST_OPACITY)
     cameras = scene.train_cameras
@@ -206,25 +210,26 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
     return splats
 
 
-def _with_dense_points(scene: Scene, count: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Positions and colours ``[P, 3]`` of the points of SfM and, up to ``count``, of the dense start.
+def _with_dense_points(scene: Scene, count: int, seed: int, least: int = 0) -> tuple[Tensor, Tensor]:
+    """Positions and colours ``[P, 3]`` of the points of SfM and, up to ``count``, or ``least``, of the dense start.
 
     Those without colours stay only where that finds too few, or photos are white around their objects. Of many more
     points than that, some are taken: splats get their sizes from the distances of these, and most would go.
     """
     fills = scene.grey and not scene.white
     known = 0 if fills else len(scene.points)
-    if count <= known:
+    room = max(count - known, least)
+    if room <= 0:
         most = MOST_POINTS * count or len(scene.points)
         return spread(scene.points, most), spread(scene.colors, most)
     start = time.perf_counter()
-    points, colors = dense_points(scene, count - known, seed)
+    points, colors = dense_points(scene, room, seed)
     trim()
     log.info(f"dense start: {len(points)} points beside {known} of SfM, {time.perf_counter() - start:.1f} s")
     if len(points) == 0:
         log.warning("photos show nothing that could be followed: training starts from SfM's points, or random ones")
-    order = slice(None, None, -1 if fills else 1)
-    return torch.cat([scene.points, points][order])[:count], torch.cat([scene.colors, colors][order])[:count]
+    order, most = slice(None, None, -1 if fills else 1), known + room
+    return torch.cat([scene.points, points][order])[:most], torch.cat([scene.colors, colors][order])[:most]
 
 
 def background_of(scene: Scene, asked: str) -> str:

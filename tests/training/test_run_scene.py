@@ -103,6 +103,29 @@ def test_of_a_dense_cloud_some_points_are_taken(known: int, kept: int) -> None:
     assert (steps == steps[0]).all()  # evenly spread
 
 
+@pytest.mark.parametrize("times", [1, 4])
+@pytest.mark.parametrize("part", [False, True])
+def test_points_of_a_part_of_the_scene_get_others_beside_them(
+    demo_scene: Path, monkeypatch: pytest.MonkeyPatch, part: bool, times: int
+) -> None:
+    """Many points in one place are no points of the others; one point many times is one."""
+    data = ColmapDataModule(str(demo_scene))
+    scene, shown = data.scene, torch.rand(1000, 3)
+    monkeypatch.setattr(run_scene, "dense_points", lambda _, count, __: (shown[:count],) * 2)
+    monkeypatch.setattr(run_scene, "far_points", lambda *_: (torch.empty(0, 3), torch.empty(0, 3)))
+    points = scene.points
+    if part:
+        points = points[points[:, 0] < points[:, 0].median()]
+        points = torch.cat([points, points + 1e-3, points - 1e-3])
+    data.scene = replace(scene, points=points.repeat(times, 1), colors=torch.rand(len(points) * times, 3))
+    assert (data.scene.covered() < run_scene.MIN_COVERED) == part
+    trainer: Any = SimpleNamespace(datamodule=data)
+    count = len(points) - 9
+    first = first_splats(trainer, 0, count, 0).means.detach()
+    assert len(first) == len(points) + part * (count // 2)
+    assert torch.equal(first[len(points) :], shown[: part * (count // 2)])
+
+
 @pytest.mark.parametrize("kept", [0.0, 0.3, 1.0])
 def test_points_that_are_always_masked_become_no_splats(
     demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: float
