@@ -41,6 +41,8 @@ _ORDER = (*_EARLY, "means", *_LATE)
 # The last take the longest, and the longest task should not begin last.
 _LONGEST_FIRST = _LATE[::-1]
 _GRID = Struct("<qqqd")
+# Bits an axis up to which a splat is stored as those far away are: one as large as the scene must keep its depth.
+_MIN_DEPTH = 8
 
 # Encodings of the streams that an attribute has, by its storage and the ends of their names.
 _STREAMS = {
@@ -71,8 +73,9 @@ def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header
         early = {name: tasks[name].result() for name in _EARLY}
         grid, doublings, depths = position_grid(scene.means, early, precision)
         cells, inside = grid.cells(scene.means)
+        inside &= depths > _MIN_DEPTH
         keys = morton.morton_keys(cells, depths)
-        # The order of the file: along the Morton curve, the far splats, whose keys are 0, at the end.
+        # The order of the file: along the Morton curve, the far splats at the end.
         order = np.lexsort([keys, ~inside])
         near, far = np.split(order, [np.count_nonzero(inside)])
         keys, depths = keys[near], depths[near]
