@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.numbers import finite_logits, finite_logs
 from nsvq_lightning.rendering.sampling import MAX_CAMERAS, Sampling, fewer_cameras
 from nsvq_lightning.splats import attributes as splat
 from nsvq_lightning.splats import conventions
@@ -168,9 +169,11 @@ class CompressedScene:
             raise ValueError(f"shN must have shape [N, (degree + 1)^2 - 1, 3], got {list(rows['shN'].shape)}")
         for name, values in rows.items():
             found[name] = np.ascontiguousarray(values, np.float32).reshape(len(values), math.prod(values.shape[1:]))
+        # Opacities of exactly 0 and 1 are infinite logits, lengths of 0 logarithms of -inf.
+        found["scales"] = finite_logs(found["scales"])
         return cls(
             found["means"],
-            found["opacities"].ravel(),
+            finite_logits(found["opacities"].ravel()),
             raw={name: found[name] for name in splat.QUANTIZABLE if name in found},
             sh_degree=shN_degree(found["shN"].shape[1] // 3),
             **header,

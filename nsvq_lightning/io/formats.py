@@ -150,12 +150,12 @@ def format_of(path: StrPath) -> Format:
 
 # What turns files of other formats, and folders, into some that are read.
 _WAYS = {
-    "": "of the folder of a run, name scene.nsvq in it",
+    "": "of the folder of a run, name scene.nsvq in it, of others lod-meta.json or meta.json",
     ".ckpt": "of a run, nsvq export --ckpt_path FILE writes its scene",
     **dict.fromkeys((".usd", ".usdc", ".usdz"), usda.BINARY_REMEDY),
     **dict.fromkeys((".ksplat", ".lcc", ".lcc2"), "splat-transform (npm) converts it"),
     ".gltf": "save it as .glb",
-    ".zip": "if meta.json and pictures are in it, name it .sog",
+    **dict.fromkeys((".zip", ".ssog"), "unzip it, and name the file in it; with meta.json and pictures, name it .sog"),
     ".pt": "of a checkpoint of gsplat: nl.save(torch.load(FILE), 'scene.ply')",
 }
 # Formats by the end of the file's name; a new format is one more entry.

@@ -15,9 +15,9 @@ import numpy as np
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, Json, as_defect, check_room, check_start, json_object, naming_file
-from nsvq_lightning.io.numbers import finite_logs, logits_of, logs_of_lengths, opacity_of
+from nsvq_lightning.io.numbers import logits_of, logs_of_lengths, opacity_of
 from nsvq_lightning.io.placing import HALF_TURN, moved, rotated
-from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float32s, Float64s, sh_coefficients, unit
+from nsvq_lightning.splats.conventions import SH_C0, Arrays, Float64s, sh_coefficients, unit
 from nsvq_lightning.top_level import log
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -217,12 +217,12 @@ def _splats(document: Json, data: memoryview, primitive: Json) -> CompressedScen
     return CompressedScene.from_rows(rows, antialiased=antialiased).take(points)
 
 
-def _logs_of_scale(scale: Arrays) -> Float32s:
+def _logs_of_scale(scale: Arrays) -> Arrays:
     """Logarithms ``[N, 3]`` of what SCALE holds: lengths, or, until the middle of 2026, their logarithms."""
     if not (scale < 0).any():
         return logs_of_lengths(scale)
     log.warning("SCALE has negative numbers: taken as logarithms of lengths, which it was in drafts")
-    return finite_logs(scale)
+    return scale
 
 
 def _accessor(document: Json, data: memoryview, number: int) -> Arrays:

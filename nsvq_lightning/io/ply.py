@@ -13,7 +13,7 @@ import numpy as np
 from nsvq_lightning.io.atomic import StrPath, atomic_write
 from nsvq_lightning.io.compressed import CompressedScene, slices
 from nsvq_lightning.io.errors import FormatError, as_defect, naming_file, wrong_start
-from nsvq_lightning.io.numbers import FLAT, Clamped, finite_logits, finite_logs, logits_of, opacity_of
+from nsvq_lightning.io.numbers import FLAT, Clamped, finite_logs, logits_of, opacity_of
 from nsvq_lightning.io.placing import FAR
 from nsvq_lightning.splats import conventions
 from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_dims
@@ -225,7 +225,8 @@ def splat_degree(header: PlyHeader) -> int:
         names = header.properties
         if missing := [name for columns in _needed(header, 0).values() for name in columns if name not in names]:
             raise FormatError(f"not a .ply of Gaussian splats: it has no property {', '.join(missing)}")
-    rest = [name for name in names if name.startswith("f_rest_")]
+    # All that stands beside the splats of a compressed file is harmonics, also by other names, as gsply 0.2 has them.
+    rest = [name for name in names if header.packed or name.startswith("f_rest_")]
     strange = sorted({*rest} - {f"f_rest_{i}" for i in range(len(rest))})
     if strange or len(rest) not in (0, 9, 24, 45):
         got = f"{len(rest)}, among them {strange[0]}" if strange else f"{len(rest)}"
@@ -310,7 +311,7 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
     known = {*needed, *_UNUSED, *_RGB, "alpha", "filter_3D"}
     if others := [name for name in header.properties if name not in known]:
         shown = " ".join(others[:5])
-        log.warning(f"{path}: {len(others)} other properties are left out ({shown}): splats that move stand still")
+        log.warning(f"{path}: {len(others)} other properties are left out ({shown}): motion, say, does not show")
     # A third scale that is not there stays flat.
     rows = {name: np.full((header.count, dim), FLAT, np.float32) for name, dim in attribute_dims(sh_degree).items()}
     kind = np.float64 if header.dtype["x"].itemsize == 8 else np.float32  # of positions on a map
@@ -325,8 +326,6 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
         white = white_of(rows["sh0"], fractions=header.dtype["red"].kind == "f")
         rows["sh0"] = ((rows["sh0"] / white - 0.5) / SH_C0).astype(np.float32)
     rows["scales"] = finite_logs(rows["scales"])
-    # Writers that store opacity as a byte make 0 and 255 infinite logits.
-    rows["opacities"] = finite_logits(rows["opacities"])
     if "filter_3D" in header.properties:
         log.info(f"{path}: filter_3D, the widths of Mip-Splatting, become part of scales and opacities")
         widths = np.concatenate([*read_ply_columns(path, header, ["filter_3D"])])
@@ -375,7 +374,7 @@ def _read_packed(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, 
     """Rows ``[N, D]`` of each attribute of a compressed ``.ply``."""
     chunk = header.others["chunk"]
     vertices = np.fromfile(path, header.dtype, header.count, offset=header.offset)
-    bounds = np.concatenate([*read_ply_columns(path, chunk, _bounds(chunk))])
+    bounds = finite_logs(np.concatenate([*read_ply_columns(path, chunk, _bounds(chunk))]))
     rows = {name: np.empty((header.count, dim), np.float32) for name, dim in attribute_dims(0).items()}
     for several in slices(header.count):
         for name, part in _of_chunks(vertices[several], bounds[several.start // _CHUNK :]).items():

@@ -272,7 +272,7 @@ def _signs(axes: str, sh_degree: int) -> tuple[Float32s, Float32s, Float32s]:
     return xyz, np.array([1, *(xyz.prod() * xyz)], np.float32), harmonics.repeat(3)
 
 
-# Versions that are written; every reader of the format supports the default.
+# Versions that are written.
 SPZ_VERSIONS = (3, 4)
 DEFAULT_VERSION = 3
 # Axes that are written; viewers take a file to have the default, whatever it says.

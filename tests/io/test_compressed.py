@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from compressed_scenes import scene as coded
 from numpy.typing import NDArray
 from viewer_scenes import plain_scene
 
 from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.io.formats import read_scene, save
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.io.placing import cropped
 
@@ -85,3 +88,15 @@ def test_parts_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("shN", "sh0"):
         np.testing.assert_array_equal(again.rows(name), turned.rows(name))
     assert scene.in_order(np.arange(50)) is scene
+
+
+def test_opacities_of_0_and_1_and_no_length_are_numbers(tmp_path: Path) -> None:
+    """Of tensors in memory, as of files."""
+    rows = {name: tensor.clone() for name, tensor in plain_scene(20, 1).tensors()._asdict().items()}
+    rows["opacities"][:2] = torch.tensor([torch.inf, -torch.inf])
+    rows["scales"][3, 2] = -torch.inf
+    scene = CompressedScene.from_splats(rows)
+    assert scene.opacities[:2].tolist() == [20, -20]
+    assert scene.raw["scales"][3, 2] == -20
+    save(scene, tmp_path / "x.nsvq")
+    assert len(read_scene(tmp_path / "x.nsvq")) == 20

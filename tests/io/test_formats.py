@@ -178,6 +178,7 @@ def test_splats_without_a_rotation_are_counted(tmp_path: Path, caplog: pytest.Lo
         ("a.lcc", "splat-transform"),
         ("a.gltf", "as .glb"),
         ("a.zip", "name it .sog"),
+        ("a.ssog", "unzip it"),
         ("a.pt", "torch.load"),
         ("runs/a", "name scene.nsvq in it"),
         ("last.ckpt", "nsvq export --ckpt_path"),

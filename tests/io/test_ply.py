@@ -177,6 +177,18 @@ def test_a_compressed_ply_is_known_by_its_header(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.shN, np.full((2, 3, 3), -4))
 
 
+@pytest.mark.parametrize("ends", [(6, 9), (6,)])
+def test_bounds_of_flat_splats_may_be_infinite(tmp_path: Path, ends: tuple[int, ...]) -> None:
+    path, data = tmp_path / "x.ply", bytearray(_packed())
+    start = data.index(b"end_header\n") + len(b"end_header\n")
+    for number in ends:
+        struct.pack_into("<f", data, start + 4 * number, -np.inf)
+    path.write_bytes(data)
+    scales = read_ply(path).values("scales")
+    assert np.isfinite(scales).all()
+    assert scales[0, 0] == -20
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [
@@ -189,6 +201,7 @@ def test_a_compressed_ply_is_known_by_its_header(tmp_path: Path) -> None:
         (_packed().replace(b"min_scale_x", b"min_scale_q"), "no property min_scale_x of type f4"),
         (_packed().replace(b"uchar f_rest_3", b"char f_rest_3"), "no property f_rest_3 of type u1"),
         (_packed().replace(b"f_rest_3", b"f_rest_9"), "got 9, among them f_rest_9"),
+        (_packed().replace(b"f_rest_", b"coeff_"), "got 9, among them coeff_0"),
         (_packed().replace(b"binary_little_endian", b"ascii"), "ascii"),
     ],
 )
