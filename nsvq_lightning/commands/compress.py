@@ -126,12 +126,13 @@ def _write_levels(options: Namespace, compressor: "Compressor", most: int) -> No
 
 def _write_file(options: Namespace, compressor: "Compressor", most: int, views: str) -> None:
     """Write the ``.nsvq`` file of at most ``most`` splats that is asked for."""
+    measure = compressor.measure  # refuses a scene that shows nothing, before it is trained
     candidate = compressor.best(most, options.codebooks, options.target_bytes, options.max_error)
     write_bytes(options.output, candidate.data)
     before, after = compressor.scene.stored_bytes or 0, len(candidate.data)
     sizes = candidate.setting.codebooks
     books = "no codebooks" if sizes == "none" else f"codebooks {sizes}"
-    error = compressor.measure.told(compressor.error(candidate), "the original")
+    error = measure.told(compressor.error(candidate), "the original")
     say(
         f"{options.output}: {len(candidate.scene):,} of {len(compressor.scene):,} splats in {after:,} bytes, "
         f"{before / after:.1f} times smaller than {options.input.name}",

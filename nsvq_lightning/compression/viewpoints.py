@@ -208,7 +208,7 @@ def likely_cameras(splats: SplatTensors, count: int, width: int = 560, height: i
     following = _following(some)
     # On four scenes of objects, the middle has 0.3 to 0.7 times as much as the best of the farthest places, in a room
     # 1.75 times.
-    if following(middle[None]) > following(middle + reach * AROUND[1] * directions).max():
+    if usual and following(middle[None]) > following(middle + reach * AROUND[1] * directions).max():
         targets = means[np.searchsorted(weights.cumsum(), even[:, 0].numpy()).clip(max=len(means) - 1)]
         low, high = np.quantile(targets, INSIDE, axis=0)
         eyes = low + (high - low) * even[:, 4:].numpy()

@@ -149,6 +149,19 @@ def test_ctrl_c_before_there_are_codebooks_is_no_other_error(
     assert "codebook" not in capsys.readouterr().err
 
 
+def test_a_scene_that_shows_nothing_is_told_before_it_is_trained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clear = ball(300)
+    clear.opacities[:] = -20
+    write_ply(tmp_path / "scene.ply", clear)
+    command = ["compress", str(tmp_path / "scene.ply"), str(tmp_path / "x.nsvq"), "--codebooks=0.5k", "--steps=4"]
+    with patch("nsvq_lightning.compression.compressor.Compressor.best") as trained:
+        assert main(command) == 1
+    assert not trained.called
+    assert "all 4 pictures of the scene are empty" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [("missing.ply", "missing.ply"), ("empty.ply", "no finite splat"), ("scene.ply", "100 bytes leave room for 0")],

@@ -56,6 +56,13 @@ def test_a_room_is_seen_from_inside(is_room: bool) -> None:
     assert max(away) < 1 if is_room else min(away) > 1
 
 
+def test_splats_in_one_place_are_seen_from_around_it() -> None:
+    torch.manual_seed(0)
+    one = RawSplats(*(tensor[:1].expand(50, *tensor.shape[1:]).contiguous() for tensor in painting()))
+    one = one._replace(shN=torch.randn(1, 15, 3).expand(50, 15, 3).contiguous())
+    assert len({tuple(eye(camera)) for camera in likely_cameras(one, 4, 64, 48)}) == 4
+
+
 def test_the_same_scene_has_the_same_views_and_the_best_come_first() -> None:
     once, again = (likely_cameras(painting(), 5, 64, 48) for _ in range(2))
     assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(once, again, strict=True))
