@@ -100,7 +100,7 @@ def run(options: Namespace) -> int:
     say(
         f"\n{database} ({database.stat().st_size / 1e6:.0f} MB) saves time when photos are added, and may be deleted",
         f"next: nsvq fit --data.root {shlex.quote(scene.as_posix())}",
-        "(with --minutes 5 it trains for so long)",
+        "(--minutes 5 stops after five minutes of training)",
     )
     return 0
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from importlib import import_module
 from io import BytesIO
-from pathlib import Path
+from pathlib import Path, PurePath
 from shutil import rmtree
 from statistics import median_high
 from tempfile import TemporaryDirectory
@@ -123,7 +123,7 @@ def reconstruct(
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     pycolmap.set_random_seed(0)
     stamps = _extract(scene, photos, report, max_size, threads)
-    _compare(scene, len(photos), report, is_video, threads)
+    _compare(scene, photos, report, is_video, threads)
     models = _map(scene, stamps, report, threads)
     common = dict(_rows(scene, _PARTNERS, json.dumps(list(photos))))
     if not models:
@@ -255,24 +255,27 @@ def remove_database(scene: Path) -> None:
 
 # Photos up to which every pair is compared; frames of a video are compared with those near them from half of it on.
 MAX_EXHAUSTIVE = 120
-# Frames after each with which it is compared, and as many farther ones at distances that double.
-OVERLAP = 12
+# How far apart the others are that are compared. By their file names alone, so that those of two cameras alternate.
+STEPS = (1, 2, 3, 4, 5, 6, 8, 12, 16, 32, 64, 128)
 
 
-def _compare(scene: Path, count: int, report: Report, is_video: bool, threads: int) -> None:
+def _compare(scene: Path, photos: Heads, report: Report, is_video: bool, threads: int) -> None:
     """Compare photos, and say now and then how many pairs are done."""
+    count = len(photos)
     pycolmap = import_pycolmap()
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
     how = {"matching_options": matching, "device": pycolmap.Device.cpu}
     exhaustive = count * (1 + is_video) <= MAX_EXHAUSTIVE
-    pairs = count * (count - 1) // 2 if exhaustive else 2 * OVERLAP * count
+    pairs = count * (count - 1) // 2 if exhaustive else len(STEPS) * count
     ended = Event()
 
     def poll() -> None:
-        while not ended.wait(timeout=1.0):
-            with suppress(sqlite3.Error):
-                done = _rows(scene, "select count(*) from two_view_geometries")[0][0]
-                report("comparing photos", min(done, pairs), pairs)
+        # One connection: closing it gives up COLMAP's locks, too, as both are of this process, and removes its log.
+        with closing(sqlite3.connect(scene / DATABASE)) as database:
+            while not ended.wait(timeout=1.0):
+                with suppress(sqlite3.Error):
+                    done = database.execute("select count(*) from two_view_geometries").fetchone()[0]
+                    report("comparing photos", min(done, pairs), pairs)
 
     polling = Thread(target=poll, daemon=True)
     polling.start()
@@ -281,13 +284,25 @@ def _compare(scene: Path, count: int, report: Report, is_video: bool, threads: i
             # Ctrl-C is heard between blocks of photos only; small ones take a tenth longer.
             blocks = pycolmap.ExhaustivePairingOptions(block_size=10)
             pycolmap.match_exhaustive(scene / DATABASE, pairing_options=blocks, **how)
-        else:
-            pairing = pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True)
+        elif any(" " in name for name in photos):  # lists of pairs have blanks between names
+            pairing = pycolmap.SequentialPairingOptions(overlap=len(STEPS), quadratic_overlap=True)
             pycolmap.match_sequential(scene / DATABASE, pairing_options=pairing, **how)
+        else:
+            names = sorted(photos, key=lambda name: (_numbered(PurePath(name).name), name))
+            listed = "".join(f"{a} {b}\n" for step in STEPS for a, b in zip(names, names[step:], strict=False))
+            with TemporaryDirectory() as folder:
+                write_text(Path(folder) / "pairs.txt", listed)
+                listing = pycolmap.ImportedPairingOptions(match_list_path=Path(folder) / "pairs.txt", block_size=500)
+                pycolmap.match_image_pairs(scene / DATABASE, pairing_options=listing, **how)
     finally:
         ended.set()
         polling.join()
     report("comparing photos", pairs, pairs)
+
+
+def _numbered(name: str) -> str:
+    """What to sort a name by, so that 10 comes after 9."""
+    return re.sub(r"\d+", lambda number: number[0].zfill(20), name)
 
 
 def _map(scene: Path, stamps: dict[str, str], report: Report, threads: int) -> list[Any]:
