@@ -170,7 +170,7 @@ def check_name(name: str, source: object, allow_outside: bool) -> None:
     try:
         name.encode()
     except UnicodeEncodeError:
-        raise SceneError(f"{source} names {name!r}, which is not UTF-8: rename that file or folder") from None
+        raise SceneError(f"{source} names {name!r}, which is not UTF-8: rename it (in a model: make it anew)") from None
     if not allow_outside and is_outside(name):
         raise SceneError(
             f"{source} names {name}, which is not in the scene folder: copy it there, or allow it in fit and test with "
@@ -389,8 +389,12 @@ def alignment(model: ColmapModel, other: ColmapModel) -> Float64s:
     Raises:
         SceneError: They share fewer than three photos, or these lie on a line, and so do not say how it turns.
     """
-    centres = [{image.name: image.centre for image in found.images} for found in (model, other)]
-    shared = sorted(centres[0].keys() & centres[1].keys())
+    for name_of in str, lambda path: PurePath(path).name:  # paths of the same photos may begin elsewhere
+        centres = [{name_of(image.name): image.centre for image in found.images} for found in (model, other)]
+        unique = [*map(len, centres)] == [len(model.images), len(other.images)]
+        shared = sorted(centres[0].keys() & centres[1].keys()) if unique else []
+        if len(shared) > 2:
+            break
     ours, theirs = (np.array([places[name] for name in shared]).reshape(-1, 3) for places in centres)
     for places in (ours, theirs):
         if len(shared) < 3 or np.linalg.matrix_rank(places - places.mean(0), 1e-6 * np.ptp(places)) < 2:
