@@ -42,6 +42,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     own_process = argv is None
     arguments = list(sys.argv[1:] if argv is None else argv)
     arguments = [text.replace("=~/", f"={os.path.expanduser('~')}/") for text in arguments]  # no shell does
+    if os.getcwd() not in sys.path:  # last, unlike `python -m`: for the user's own quantizers and callbacks
+        sys.path.append(os.getcwd())
     name = arguments[0] if arguments else ""
     if name in ("", "--help", "-h", "help"):
         sys.stdout.write(overview())
@@ -203,8 +205,6 @@ def _run_lightning(arguments: list[str], own_process: bool) -> int:
 
     _show_log()
     _quiet_lightning()
-    if os.getcwd() not in sys.path:  # last, unlike `python -m`: for the user's own quantizers and callbacks
-        sys.path.append(os.getcwd())
     configs = configs_among(arguments)
     try:
         run_cli(arguments)

@@ -71,6 +71,14 @@ def _drop_settings_of_another_class(_: Any, before: Any, value: Any) -> None:
 check_replaced("jsonargparse", typehints, "discard_init_args_on_class_path_change")
 typehints.discard_init_args_on_class_path_change = _drop_settings_of_another_class
 
+# What the parser says of types that do not fit; what a class has said of its settings is the cause, and comes first.
+_UNFIT = "Not a valid subclass", "Import path", "Expected a"
+check_replaced("jsonargparse", typehints, "raise_union_unexpected_value")
+_raise = typehints.raise_union_unexpected_value
+typehints.raise_union_unexpected_value = lambda subtypes, val, exceptions: _raise(
+    subtypes, val, sorted(exceptions, key=lambda error: str(error).startswith(_UNFIT))
+)
+
 
 # Names that options take as they are: short class names resolve to what is imported.
 CLASSES = (*callbacks.__all__, *quantize.__all__, "ColmapDataModule", "DemoDataModule")
@@ -101,7 +109,7 @@ def in_plain_words(message: str, arguments: Iterable[str]) -> str:
     if problem := re.search(causes, message, re.S):
         return f"{name}: {' '.join(problem[0].split())}{meant}"
     types = re.search(r"Subtypes: .*", message) or re.search(r"Expected a .*", message)
-    kinds = r"Literal\[(.*?)\]|(?:<class '(?:[\w.]*\.)?|Annotated\[)(\w+)"
+    kinds = r"Literal\[(.*?)\]|(?:<class '(?:[\w.]*\.)?|Annotated\[|\b(?=dict\[))(\w+)"
     allowed = []
     for literal, kind in re.findall(kinds, types[0] if types else ""):
         if literal:
