@@ -165,7 +165,7 @@ class DensityControl(Densification):
 
     During warm-up the norm of the screen-space gradient is averaged over the views that see a splat; at the scheduled
     iterations splats above the threshold are cloned or split, transparent and huge ones pruned, and opacities reset. In
-    the prune phase (paper, section 3.4) transparent splats are pruned and none are added. Non-finite splats are dropped
+    the prune phase (paper, section 3.2) transparent splats are pruned and none are added. Non-finite splats are dropped
     in every phase.
 
     Callbacks that remove or add splats may come before or after it. A view whose splats were changed before its step

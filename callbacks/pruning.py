@@ -19,7 +19,7 @@ from .settings import Count, NonNegative
 class OpacityRegularization(SplatCallback):
     """Adds λ · Σ opacity to the loss during the prune phase, so that unneeded splats fade and are pruned.
 
-    The term is a sum over the splats (paper, section 3.4), so its strength grows with their number. A shorter run has
+    The term is a sum over the splats (paper, section 3.2), so its strength grows with their number. A shorter run has
     fewer iterations for splats to fade, and a proportionally larger λ
     (:meth:`nsvq_lightning.training.schedule.Schedule.strength`).
 

@@ -125,7 +125,7 @@ class PhaseSchedule(SplatCallback):
             self._set_max_steps(trainer, steps)
             log.info(f"iterations: {steps}, about {self.minutes:g} min of training; evaluations and test come on top")
             if steps < MIN_ITERATIONS:
-                log.warning("that is few: smaller photos (--data.max_width=800) or fewer splats (--quality=0.5) help")
+                log.warning("that is few: a smaller --data.max_width, or a smaller --quality, helps")
         elif self.iterations_per_photo is not None and self.total is None:
             need = "a number of iterations for each photo needs the photos"
             photos = len(run_scene.needed_scene(trainer, need, "leave iterations_per_photo unset").train)

@@ -56,7 +56,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     turn("--matrix", nargs=12, type=float, metavar=tuple("ABCDEFGHIJKL"), help=help_)
     help_ = "move the scene so that the cameras of --data.root are where those of this scene folder are, by photo name"
     turn("--align", type=Path, metavar="FOLDER", help=help_)
-    add("--up-from", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where up is in the input, for --up")
+    add("--up-from", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where up is, for --up; mostly 0 -1 0")
     add_root(parser, "scene folder for --floaters, --up, --align; for --measure, --splats in place of its own pictures")
 
 
@@ -103,7 +103,7 @@ def _contradiction(options: Namespace) -> str:
     if options.align and not options.root:
         return "--align moves the cameras of a scene folder: add --data.root"
     if options.up and not (options.up_from or options.root):
-        return "--up needs to know where up is now: add --data.root or --up-from"
+        return "--up needs to know where up is now: add --data.root or --up-from (0 -1 0 in most files)"
     if options.root and not uses_photos and formats.suffix_of(options.output) != ".nsvq":
         return "--data.root says where to measure: add --measure"
     if options.measure and (moves or options.crop or options.floaters or options.splats or len(options.inputs) > 1):

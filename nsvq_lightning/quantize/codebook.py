@@ -321,7 +321,9 @@ class Quantizer(Protocol):
     """Vector quantizer of one attribute: maps rows ``[N, D]`` to codes ``[N]``, indices into a codebook ``[K, D]``.
 
     Implementations are ``nn.Module``s whose ``codebook`` is an ``nn.Parameter`` and whose usage counters and frozen
-    codes are buffers, so that checkpoints and device moves carry them.
+    codes are buffers, so that checkpoints and device moves carry them. Buffers whose length changes (``codes``, and
+    what follows a codebook of which ``fit`` leaves fewer rows) need their new length in ``_load_from_state_dict``, as
+    :class:`~nsvq_lightning.quantize.CodebookQuantizer` does it: otherwise no checkpoint can be loaded.
 
     Callbacks also use what they find of ``held`` and ``hold``, ``refit``, ``limit`` and ``mend`` of
     :class:`~nsvq_lightning.quantize.CodebookQuantizer`, and leave a quantizer without them alone.

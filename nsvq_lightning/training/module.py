@@ -452,7 +452,7 @@ class SplatModule(LightningModule):
 
 
 def _photometric_term(module: SplatModule, rendered: Render, view: View) -> Tensor:
-    """(1 - w)·L1 + w·(1 - SSIM) of picture and photo (paper, section 3.3); later for PSNR."""
+    """(1 - w)·L1 + w·(1 - SSIM) of picture and photo (Kerbl et al. 2023, eq. 7); later for PSNR."""
     late = module.psnr_loss and module.phase > Phase.WARMUP
     return photometric_loss(rendered.image, view.image, module.dssim_weight, view.mask, psnr=late)
 
