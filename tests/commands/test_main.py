@@ -182,6 +182,7 @@ SCENE = ["--config=demo", "--callbacks.progress=null"]
         ("--trainer.devices=0", "devices='0'"),
         ("--trainer.strategy=nothing", "strategy='nothing'"),
         ("--callbacks.density.budget=1", "budget must be at least min_splats=10, got 1"),
+        ('--callbacks.density={"class_path": "DensityControl", "init_args": {"max_splats": -1}}', "max_splats must be"),
         ("--callbacks.report.every=-1", "every must be at least 0, got -1"),
         ("--trainer.logger=MLFlowLogger", "mlflow"),
         ("--trainer.accelerator=gpu", "No supported gpu backend found"),
@@ -327,6 +328,20 @@ def test_a_closed_output_ends_no_command(tmp_path: Path, monkeypatch: pytest.Mon
     assert main(["convert", str(tmp_path / "scene.ply"), str(tmp_path / "x.nsvq"), "--crop", *nowhere]) == 1
     for stream in (sys.stdout, sys.stderr):
         stream.close()
+
+
+def test_settings_of_a_callback_may_be_in_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "density.yaml").write_text("budget: 1")
+    assert main(["fit", *SCENE, f"--callbacks.density={tmp_path / 'density.yaml'}"]) == 1
+    assert "budget must be at least min_splats=10, got 1" in capsys.readouterr().err
+
+
+def test_commands_find_classes_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also those that resolve the options of fit, as a sweep does."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert main(["--version"]) == 0
+    assert sys.path[-1] == str(tmp_path)
 
 
 def test_home_is_found_behind_an_equals_sign(

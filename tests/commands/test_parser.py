@@ -96,6 +96,9 @@ READ = """Parser key "bytes":
     - Expected a <class 'int'>. Got value: 1000000.0
     - Expected a <class 'NoneType'>. Got value: 1000000.0
   Given value: 1e6"""
+NUMBERS = """Parser key "model.codebooks":
+  Subtypes: [<class 'str'>, dict[str, int], <class 'NoneType'>]
+  Given value: 3.5"""
 CLASS = """Parser key "model.quantizer":
 
   - Expected a path but NSVX either not accessible or invalid
@@ -113,6 +116,7 @@ INVALID = """Parser key "data":
         ("another message", "another message"),
         ("Parser key \"a.b\":\n  Expected a <class 'int'>. Got value: x", "a.b: expected a whole number, got 'x'"),
         (UNION, "data.factor: expected 1, 2, 4, 8 or null, got '3'"),
+        (NUMBERS, "model.codebooks: expected text, dict or null, got '3.5'"),
         (READ, "bytes: expected a whole number or null, got '1e6'"),
         (CLASS, "model.quantizer: expected the name of a class, got 'NSVX'; did you mean NSVQ?"),
         (INVALID, "data: Problem with given class_path 'a.B': No module named 'a'"),

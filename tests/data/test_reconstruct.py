@@ -2,7 +2,10 @@ from __future__ import annotations
 
 import os
 import re
+import sqlite3
 import struct
+import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -438,6 +441,55 @@ def test_stamps_of_a_database_that_is_gone_are_forgotten(tmp_path: Path) -> None
     reconstruct.remove_database(tmp_path)
     _extracted(tmp_path, names[1:])
     assert stamps_in(tmp_path).keys() == {names[1]}
+
+
+def _compared(scene: Path, names: list[str], monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
+    """The pairs of photos that COLMAP is asked to compare, each once."""
+    pairs: list[set[str]] = []
+
+    def listed(_: object, pairing_options: Any, **__: object) -> None:
+        lines = Path(pairing_options.match_list_path).read_text(encoding="utf-8").splitlines()
+        pairs.extend(set(line.split()) for line in lines)
+
+    monkeypatch.setattr(import_pycolmap(), "match_image_pairs", listed)
+    scene.mkdir(exist_ok=True)
+    reconstruct._compare(scene, dict.fromkeys(names, ImageHead((8, 8), 1, False)), _silent, False, 1)
+    assert len({frozenset(pair) for pair in pairs}) == len(pairs)
+    return pairs
+
+
+def test_photos_of_two_cameras_and_unpadded_numbers_are_compared_with_near_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pairs = _compared(tmp_path, [f"{side}/{k}.jpg" for side in ("left", "right") for k in range(100)], monkeypatch)
+    assert all({f"left/{k}.jpg", f"right/{k}.jpg"} in pairs for k in range(100))
+    assert all({f"left/{k}.jpg", f"left/{k + 2}.jpg"} in pairs for k in range(98))
+    near = _compared(tmp_path, [f"{k}.jpg" for k in range(150)], monkeypatch)
+    assert all({f"{k}.jpg", f"{k + step}.jpg"} in near for step in (1, 2, 3, 4, 5, 6) for k in range(144))
+    assert len(near) < 12 * 150
+
+
+def test_the_progress_of_comparing_leaves_the_database_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To close it would take COLMAP's log away."""
+    opened, seen = [], []
+
+    def connect(path: Path) -> sqlite3.Connection:
+        opened.append(path)
+        return real(path, check_same_thread=False)
+
+    def matching(path: Path, **_: object) -> None:
+        with closing(real(path)) as database, database:
+            database.execute("create table two_view_geometries (pair_id)")
+            database.execute("insert into two_view_geometries values (1), (2)")
+        time.sleep(2.5)
+
+    real = sqlite3.connect
+    monkeypatch.setattr(sqlite3, "connect", connect)
+    monkeypatch.setattr(import_pycolmap(), "match_exhaustive", matching)
+    photos = {f"{k}.jpg": ImageHead((8, 8), 1, False) for k in range(9)}
+    reconstruct._compare(tmp_path, photos, lambda _, done, total: seen.append((done, total)), False, 1)
+    assert seen[-2:] == [(2, 36), (36, 36)]
+    assert opened == [tmp_path / reconstruct.DATABASE]
 
 
 def test_cameras_are_placed_again_for_other_photos_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -312,6 +312,19 @@ def test_names_are_those_of_the_nearest_photos(
     assert "9 of 9 files have other names than in" in caplog.text
 
 
+def test_photos_two_folders_deep_are_those_of_the_model(demo_scene: Path, tmp_path: Path) -> None:
+    """As instant-ngp's script writes them that was called from a folder above."""
+    root = write_nerfstudio(demo_scene, tmp_path / "scene", APPLIED, ply_file_path=None)
+    (root / "points.ply").unlink()
+    shutil.copytree(demo_scene / "sparse", root / "colmap_sparse")
+    (root / "data").mkdir()
+    (root / "images").rename(root / "data/images")
+    text = (root / "transforms.json").read_text().replace("images/", "data/images/")
+    (root / "transforms.json").write_text(text)
+    turned = torch.from_numpy(APPLIED[:, :3]).float()
+    torch.testing.assert_close(load_scene(root).points, load_scene(demo_scene).points @ turned.T, rtol=0, atol=1e-4)
+
+
 @pytest.mark.parametrize("name", ["points3d.ply", "dense.PLY", "colmap/sparse/0"])
 def test_points_that_no_file_names_are_used(
     demo_scene: Path, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
