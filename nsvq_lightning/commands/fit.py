@@ -150,7 +150,7 @@ class SplatCLI(LightningCLI):
             default = None if name in OPTIONAL else {"class_path": f"{kind.__module__}.{kind.__qualname__}"}
             # Settings alone mean the standard class; another one need not be derived from it.
             about = first_sentence(kind.__doc__)
-            parser.add_argument(f"--{key}", type=kind | Callback | None, default=default, help=about, enable_path=True)
+            parser.add_argument(f"--{key}", type=kind | Callback | None, default=default, help=about, sub_configs=True)
             parser.callback_keys.append(key)
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:

@@ -42,8 +42,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     own_process = argv is None
     arguments = list(sys.argv[1:] if argv is None else argv)
     arguments = [text.replace("=~/", f"={os.path.expanduser('~')}/") for text in arguments]  # no shell does
-    if os.getcwd() not in sys.path:  # last, unlike `python -m`: for the user's own quantizers and callbacks
-        sys.path.append(os.getcwd())
+    if "" not in sys.path:  # the current folder; last, unlike `python -m`: for the user's own quantizers and callbacks
+        sys.path.append("")
     name = arguments[0] if arguments else ""
     if name in ("", "--help", "-h", "help"):
         sys.stdout.write(overview())

@@ -284,7 +284,7 @@ def _compare(scene: Path, photos: Heads, report: Report, is_video: bool, threads
             # Ctrl-C is heard between blocks of photos only; small ones take a tenth longer.
             blocks = pycolmap.ExhaustivePairingOptions(block_size=10)
             pycolmap.match_exhaustive(scene / DATABASE, pairing_options=blocks, **how)
-        elif any(" " in name for name in photos):  # lists of pairs have blanks between names
+        elif any(re.search("^#| ", name) for name in photos):  # a list of pairs cannot have such names
             pairing = pycolmap.SequentialPairingOptions(overlap=len(STEPS), quadratic_overlap=True)
             pycolmap.match_sequential(scene / DATABASE, pairing_options=pairing, **how)
         else:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import gc
+import os
 import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -340,8 +342,18 @@ def test_commands_find_classes_of_the_current_folder(tmp_path: Path, monkeypatch
     """Also those that resolve the options of fit, as a sweep does."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
+    Path("of_this_folder.py").write_text("value = 3")
     assert main(["--version"]) == 0
-    assert sys.path[-1] == str(tmp_path)
+    assert import_module("of_this_folder").value == 3
+
+
+@pytest.mark.skipif(os.name == "nt", reason="where folders in use cannot be deleted")
+def test_a_deleted_folder_ends_no_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert main(["--version"]) == 0
+    monkeypatch.chdir(tmp_path)
 
 
 def test_home_is_found_behind_an_equals_sign(

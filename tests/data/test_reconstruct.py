@@ -467,6 +467,11 @@ def test_photos_of_two_cameras_and_unpadded_numbers_are_compared_with_near_ones(
     near = _compared(tmp_path, [f"{k}.jpg" for k in range(150)], monkeypatch)
     assert all({f"{k}.jpg", f"{k + step}.jpg"} in near for step in (1, 2, 3, 4, 5, 6) for k in range(144))
     assert len(near) < 12 * 150
+    sequences: list[object] = []
+    monkeypatch.setattr(import_pycolmap(), "match_sequential", lambda path, **_: sequences.append(path))
+    for name in ("IMG (1).jpg", "#1.jpg"):
+        assert _compared(tmp_path, [f"{k}.jpg" for k in range(150)] + [name], monkeypatch) == []
+    assert len(sequences) == 2
 
 
 def test_the_progress_of_comparing_leaves_the_database_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

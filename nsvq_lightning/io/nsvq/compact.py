@@ -31,6 +31,7 @@ from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 from nsvq_lightning.io.nsvq.precision import MAX_OPACITY_LEVELS, Precision
 from nsvq_lightning.io.nsvq.rounding import SMALL, Stored, doublings_of, leaf_paths, position_grid, rounded
 from nsvq_lightning.io.numbers import float_rows, logits_of
+from nsvq_lightning.rendering.frame import middle_of
 from nsvq_lightning.splats.attributes import QUANTIZABLE
 from nsvq_lightning.splats.conventions import Int32s, Int64s, Uint64s
 
@@ -41,8 +42,9 @@ _ORDER = (*_EARLY, "means", *_LATE)
 # The last take the longest, and the longest task should not begin last.
 _LONGEST_FIRST = _LATE[::-1]
 _GRID = Struct("<qqqd")
-# Bits an axis up to which a splat is stored as those far away are: one as large as the scene must keep its depth.
-_MIN_DEPTH = 8
+# Where cells are wider than this share of the distance of four fifths of the splats from the middle, splats are stored
+# as those far away are: as large as the scene, they must stay behind what they are behind.
+_WIDE = 1 / 8
 
 # Encodings of the streams that an attribute has, by its storage and the ends of their names.
 _STREAMS = {
@@ -73,7 +75,7 @@ def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header
         early = {name: tasks[name].result() for name in _EARLY}
         grid, doublings, depths = position_grid(scene.means, early, precision)
         cells, inside = grid.cells(scene.means)
-        inside &= depths > _MIN_DEPTH
+        inside &= grid.step * 2.0 ** (morton.AXIS_BITS - depths) <= _WIDE * middle_of(scene.means)[1]
         keys = morton.morton_keys(cells, depths)
         # The order of the file: along the Morton curve, the far splats at the end.
         order = np.lexsort([keys, ~inside])
