@@ -436,10 +436,11 @@ def _odd_lens(number: int, lens: Pinhole, size: tuple[int, int]) -> list[str]:
     """What numbers lenses hardly have, or that undistortion leaves less than half of photos of a size, if so."""
     (fx, _, cx), (_, fy, cy) = lens.K[:2].tolist()
     is_usual = 0.5 < fx / fy < 2 and 0.1 < cx / lens.width < 0.9 and 0.1 < cy / lens.height < 0.9
+    is_usual &= 0.1 < fx / lens.width < 20  # pixels, not millimetres
     if is_usual and 2 * lens.width * lens.height >= math.prod(size):
         return []
     return [
-        f"camera {number} is odd: focal lengths {fx:.4g} and {fy:.4g}, centre ({cx:.4g}, {cy:.4g}), and "
+        f"camera {number} is odd: focal lengths {fx:.4g} and {fy:.4g} pixels, centre ({cx:.4g}, {cy:.4g}), and "
         f"{lens.width}x{lens.height} of {size[0]}x{size[1]} pixels are left without distortion: were photos "
         "scaled, cropped or turned after it was calibrated?"
     ]

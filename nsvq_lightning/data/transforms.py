@@ -157,7 +157,7 @@ class _Frame:
         k1, k2, k3, k4, p1, p2 = map(self.number, ("k1", "k2", "k3", "k4", "p1", "p2"), listed)
         usual = "OPENCV_FISHEYE" if self.values.get("is_fisheye") else "OPENCV"
         other = (key.upper() for key in _OTHER_LENSES if self.values.get(key))
-        model = next(other, self.values.get("camera_model", usual))
+        model = next(other, str(self.values.get("camera_model", usual)).upper())
         if model == "OPENCV_FISHEYE" and not (p1 or p2):
             return model, width, height, (*pinhole, k1, k2, k3, k4)
         if model not in _PERSPECTIVE or k4:

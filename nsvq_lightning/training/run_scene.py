@@ -226,8 +226,11 @@ def _with_dense_points(scene: Scene, count: int, seed: int, least: int = 0) -> t
     points, colors = dense_points(scene, room, seed)
     trim()
     log.info(f"dense start: {len(points)} points beside {known} of SfM, {time.perf_counter() - start:.1f} s")
-    if len(points) == 0:
-        log.warning("photos show nothing that could be followed: training starts from SfM's points, or random ones")
+    if 2 * len(points) < (room if fills else 1):
+        log.warning(
+            "photos show little that could be followed: training starts from SfM's points, or random ones; are the "
+            "cameras right (focal lengths in pixels; in a transforms file camera to world, y up, z backward)?"
+        )
     order, most = slice(None, None, -1 if fills else 1), known + room
     return torch.cat([scene.points, points][order])[:most], torch.cat([scene.colors, colors][order])[:most]
 

@@ -99,6 +99,7 @@ def test_along_a_way_what_is_near_is_before_no_near_plane(
         ("PINHOLE", (30.0, 31.0, 0.5, 0.5), True),  # in shares
         ("PINHOLE", (60.0, 62.0, 42.0, 30.0), True),  # of photos twice as large
         ("PINHOLE", (30.0, 80.0, 21.0, 15.0), True),
+        ("PINHOLE", (3.0, 3.1, 21.0, 15.0), True),  # in millimetres
         ("SIMPLE_RADIAL", (30.0, 20.0, 16.0, 0.1), False),
         ("SIMPLE_RADIAL", (30.0, 20.0, 16.0, -30.0), True),
     ],

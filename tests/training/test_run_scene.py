@@ -89,6 +89,19 @@ def test_points_without_colours_only_fill_up_what_photos_show(
         assert len(each) == 40
 
 
+@pytest.mark.parametrize(
+    ("grey", "found", "told"), [(True, 19, True), (True, 20, False), (False, 1, False), (False, 0, True)]
+)
+def test_photos_that_cameras_do_not_fit_are_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, grey: bool, found: int, told: bool
+) -> None:
+    """Of wrong axes or focal lengths, the flow between photos follows little."""
+    monkeypatch.setattr(run_scene, "dense_points", lambda *_: (torch.ones(found, 3),) * 2)
+    scene: Any = SimpleNamespace(points=torch.zeros(5, 3), colors=torch.zeros(5, 3), grey=grey, white=False)
+    run_scene._with_dense_points(scene, 40, 0)
+    assert ("are the cameras right (focal lengths in pixels" in caplog.text) == told
+
+
 @pytest.mark.parametrize(("known", "kept"), [(40, 40), (80, 80), (81, 41), (4000, 80)])
 def test_of_a_dense_cloud_some_points_are_taken(known: int, kept: int) -> None:
     points = torch.arange(3.0 * known).view(known, 3)
