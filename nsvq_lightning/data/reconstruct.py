@@ -255,7 +255,8 @@ def remove_database(scene: Path) -> None:
 
 # Photos up to which every pair is compared; frames of a video are compared with those near them from half of it on.
 MAX_EXHAUSTIVE = 120
-# How far apart the others are that are compared. By their file names alone, so that those of two cameras alternate.
+# How far apart the others are that are compared. In two folders by their file names, so that those of two cameras
+# alternate; in more, neighbours of one folder would be too far apart.
 STEPS = (1, 2, 3, 4, 5, 6, 8, 12, 16, 32, 64, 128)
 
 
@@ -266,7 +267,7 @@ def _compare(scene: Path, photos: Heads, report: Report, is_video: bool, threads
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
     how = {"matching_options": matching, "device": pycolmap.Device.cpu}
     exhaustive = count * (1 + is_video) <= MAX_EXHAUSTIVE
-    pairs = count * (count - 1) // 2 if exhaustive else len(STEPS) * count
+    pairs = count * (count - 1) // 2 if exhaustive else sum(max(count - step, 0) for step in STEPS)
     ended = Event()
 
     def poll() -> None:
@@ -288,11 +289,12 @@ def _compare(scene: Path, photos: Heads, report: Report, is_video: bool, threads
             pairing = pycolmap.SequentialPairingOptions(overlap=len(STEPS), quadratic_overlap=True)
             pycolmap.match_sequential(scene / DATABASE, pairing_options=pairing, **how)
         else:
-            names = sorted(photos, key=lambda name: (_numbered(PurePath(name).name), name))
+            alternate = len({PurePath(name).parent for name in photos}) == 2
+            names = sorted(photos, key=lambda name: (_numbered(PurePath(name).name if alternate else name), name))
             listed = "".join(f"{a} {b}\n" for step in STEPS for a, b in zip(names, names[step:], strict=False))
             with TemporaryDirectory() as folder:
                 write_text(Path(folder) / "pairs.txt", listed)
-                listing = pycolmap.ImportedPairingOptions(match_list_path=Path(folder) / "pairs.txt", block_size=500)
+                listing = pycolmap.ImportedPairingOptions(match_list_path=Path(folder) / "pairs.txt", block_size=100)
                 pycolmap.match_image_pairs(scene / DATABASE, pairing_options=listing, **how)
     finally:
         ended.set()

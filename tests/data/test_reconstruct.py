@@ -464,6 +464,8 @@ def test_photos_of_two_cameras_and_unpadded_numbers_are_compared_with_near_ones(
     pairs = _compared(tmp_path, [f"{side}/{k}.jpg" for side in ("left", "right") for k in range(100)], monkeypatch)
     assert all({f"left/{k}.jpg", f"right/{k}.jpg"} in pairs for k in range(100))
     assert all({f"left/{k}.jpg", f"left/{k + 2}.jpg"} in pairs for k in range(98))
+    parts = _compared(tmp_path, [f"{part}/{k}.jpg" for part in range(5) for k in range(30)], monkeypatch)
+    assert all({f"{part}/{k}.jpg", f"{part}/{k + 1}.jpg"} in parts for part in range(5) for k in range(29))
     near = _compared(tmp_path, [f"{k}.jpg" for k in range(150)], monkeypatch)
     assert all({f"{k}.jpg", f"{k + step}.jpg"} in near for step in (1, 2, 3, 4, 5, 6) for k in range(144))
     assert len(near) < 12 * 150
