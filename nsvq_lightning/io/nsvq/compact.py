@@ -75,7 +75,7 @@ def encode_compact(scene: CompressedScene, precision: Precision) -> tuple[Header
         early = {name: tasks[name].result() for name in _EARLY}
         grid, doublings, depths = position_grid(scene.means, early, precision)
         cells, inside = grid.cells(scene.means)
-        inside &= grid.step * 2.0 ** (morton.AXIS_BITS - depths) <= _WIDE * middle_of(scene.means)[1]
+        inside &= grid.step * 2.0 ** (morton.AXIS_BITS - depths) <= _WIDE * (len(scene) and middle_of(scene.means)[1])
         keys = morton.morton_keys(cells, depths)
         # The order of the file: along the Morton curve, the far splats at the end.
         order = np.lexsort([keys, ~inside])
