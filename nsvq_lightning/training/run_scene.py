@@ -192,12 +192,12 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
     scene = needed_scene(trainer, "no splats to start from", "set init_from").standard
     if count is None:
         return Splats.from_points(scene.points, scene.colors, sh_degree)
-    scene = scene.thinned(MOST_POINTS * count or len(scene.points))
     rows = distinct_rows(scene.points)  # meshes have a corner once for each of its triangles
     grey = scene.grey or len(rows) < FEW_POINTS
     scene = replace(scene, points=scene.points[rows], colors=scene.colors[rows], grey=grey)
     if any(source.masked for source in scene.images.sources):
         # What is always masked is not trained, only in the way.
+        scene = scene.thinned(MOST_POINTS * count or len(scene.points))
         shown = torch.from_numpy(colors_at(scene, scene.points.double().numpy(), 1)[1][:, 0] > 0)
         scene = replace(scene, points=scene.points[shown], colors=scene.colors[shown]) if shown.any() else scene
     is_part = len(scene.points) > count // 2 and scene.covered() < MIN_COVERED
@@ -217,22 +217,22 @@ def _with_dense_points(scene: Scene, count: int, seed: int, least: int = 0) -> t
     points than that, some are taken: splats get their sizes from the distances of these, and most would go.
     """
     fills = scene.grey and not scene.white
-    known = 0 if fills else len(scene.points)
+    points, colors = (spread(each, MOST_POINTS * count or len(each)) for each in (scene.points, scene.colors))
+    known = 0 if fills else len(points)
     room = max(count - known, least)
     if room <= 0:
-        most = MOST_POINTS * count or len(scene.points)
-        return spread(scene.points, most), spread(scene.colors, most)
+        return points, colors
     start = time.perf_counter()
-    points, colors = dense_points(scene, room, seed)
+    dense, dense_colors = dense_points(scene, room, seed)
     trim()
-    log.info(f"dense start: {len(points)} points beside {known} of SfM, {time.perf_counter() - start:.1f} s")
-    if 2 * len(points) < (room if fills else 1):
+    log.info(f"dense start: {len(dense)} points beside {known} of SfM, {time.perf_counter() - start:.1f} s")
+    if 2 * len(dense) < (room if fills else 1):
         log.warning(
             "photos show little that could be followed: training starts from SfM's points, or random ones; are the "
             "cameras right (focal lengths in pixels; in a transforms file camera to world, y up, z backward)?"
         )
     order, most = slice(None, None, -1 if fills else 1), known + room
-    return torch.cat([scene.points, points][order])[:most], torch.cat([scene.colors, colors][order])[:most]
+    return torch.cat([points, dense][order])[:most], torch.cat([colors, dense_colors][order])[:most]
 
 
 def background_of(scene: Scene, asked: str) -> str:
