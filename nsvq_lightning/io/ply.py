@@ -325,8 +325,8 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
     if columns["sh0"] == _RGB:
         white = white_of(rows["sh0"], fractions=header.dtype["red"].kind == "f")
         rows["sh0"] = ((rows["sh0"] / white - 0.5) / SH_C0).astype(np.float32)
-    rows["scales"] = finite_logs(rows["scales"])
     if "filter_3D" in header.properties:
+        rows["scales"] = finite_logs(rows["scales"])
         log.info(f"{path}: filter_3D, the widths of Mip-Splatting, become part of scales and opacities")
         widths = np.concatenate([*read_ply_columns(path, header, ["filter_3D"])])
         wider = np.log(np.hypot(np.exp(rows["scales"]), widths))
