@@ -213,14 +213,14 @@ def read_mask(path: Path, size: Size) -> Bools:
 
     So white and 1 are kept, in 8 or 16 bits, black is excluded. Where pixels are transparent, that is the mask; in
     colours or small numbers, as of labels or of photos cut out, all counts that is not black. A mask of another size is
-    scaled.
+    scaled, unless it is a few percent off: then it is of the photo before it was cut or undistorted.
 
     Args:
         path: Image file.
         size: Width and height of the photo, pixels.
 
     Raises:
-        SceneError: The file is damaged, or has another aspect ratio than the photo.
+        SceneError: The file is damaged, or shows another part than the photo (:func:`is_cut`).
     """
     pixels = _decoded(path, cv2.IMREAD_UNCHANGED)
     pixels = pixels.reshape(*pixels.shape[:2], -1)
@@ -232,7 +232,7 @@ def read_mask(path: Path, size: Size) -> Bools:
     elif levels.max() < 32 or np.ptp(colours, axis=2).max() > levels.max() / 16:
         black = 1 / 32  # also after JPEG
     bright = levels > black * levels.max()
-    if not same_shape(bright.shape[::-1], size):
+    if is_cut(bright.shape[::-1], size):
         raise SceneError(
             f"mask {path} is of {bright.shape[1]}x{bright.shape[0]}, its photo of {size[0]}x{size[1]}, another shape: "
             "make it from that photo, or remove it"

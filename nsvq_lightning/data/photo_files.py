@@ -189,7 +189,7 @@ def find_masks(
     usual = [root / name for name in folders if (root / name).is_dir()][:1]
     places = usual
     if not usual and not has_own and folders[-1] == "masks":
-        below = sorted({*root.glob("*"), *photos.glob("*")})
+        below = sorted({*root.rglob("*"), *photos.glob("*")})
         places = [path for path in below if _OF_MASKS.search(path.name) and path.is_dir()]
         places.append(photos)
     found = {place: masks for place in places if any(masks := masks_in(place, named, files, place == photos))}

@@ -121,6 +121,7 @@ def test_the_only_folder_that_has_the_photos_is_used(tmp_path: Path, place: str)
         "mask/{}.JPG_mask.png",
         "images_masks/mask_{}.PNG",
         "images/masks/{}.png",
+        "dense/0/masks/{}.jpg.png",
     ],
 )
 def test_masks_are_found_in_the_only_place_that_has_some(

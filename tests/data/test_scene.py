@@ -770,6 +770,7 @@ def test_useless_masks_are_named(make_scene: SceneFactory, caplog: pytest.LogCap
     for mask, message in (
         (np.zeros((32, 40), np.uint8), r"no pixel of .*000\.png counts by its mask .*masks/000\.png: masks are white"),
         (np.full((40, 32), 255, np.uint8), r"mask .*000\.png is of 32x40, its photo of 40x32, another shape"),
+        (np.full((35, 44), 255, np.uint8), r"mask .*000\.png is of 44x35, its photo of 40x32, another shape"),
     ):
         write_masks(root, ["000.png"], mask)
         with pytest.raises(SceneError, match=message):
