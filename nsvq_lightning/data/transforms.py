@@ -88,7 +88,7 @@ def _with_colmap_points(poses: ColmapModel, root: Path) -> ColmapModel:
     except SceneError as error:
         log.warning(f"the points of {root / models[0]} are not used: {error}")
         return poses
-    log.info(f"{root / poses.source} names no points: those of {root / models[0]} are used")
+    log.info(f"the transforms file of {root} names no points: those of {root / models[0]} are used")
     return replace(poses, points=transformed(found.points, moved), colors=found.colors)
 
 
@@ -343,7 +343,7 @@ def _points(
         check_name(_plain(name), f"ply_file_path in {root}", allow_outside)
         path: Path | None = root / _plain(name)
     elif path := cloud_in([root]):
-        log.info(f"{root} names no points: those of {path} are used")
+        log.info(f"the transforms file of {root} names no points: those of {path} are used")
     if path is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     points, colors = read_points(path)

@@ -103,6 +103,12 @@ def test_labels_with_numbers_are_no_points(tmp_path: Path) -> None:
     assert [image.name for image in read_images(path)] == [f"my frame {number:04}" for number in range(1, 6)]
 
 
+def test_points_of_images_may_have_identifiers_with_decimals(tmp_path: Path) -> None:
+    path = tmp_path / "images.txt"
+    path.write_text("".join(f"{number} {POSE} 1 {number}.jpg\n" + "3.5 4.5 -1.0 " * 4 + "\n" for number in (1, 2)))
+    assert [image.name for image in read_images(path)] == ["1.jpg", "2.jpg"]
+
+
 def test_sizes_are_rounded(tmp_path: Path) -> None:
     path = tmp_path / "cameras.txt"
     path.write_text("1 PINHOLE 79.99999 60.00001 80 80 40 30\n")
