@@ -337,14 +337,15 @@ _USUAL_FRACTION = 12
 def _fraction_bits(scene: CompressedScene) -> int:
     """Fractional bits: what the smallest splats need, unless that puts the farthest out of range.
 
-    A few distant splats do not make positions coarser than the format's usual 12 bits; they are clamped.
+    A few distant splats do not make positions coarser than the format's usual 12 bits; they are clamped. A sky, of a
+    thousandth of the splats or more, may have as many of these bits as half of the splats do not need.
     """
     sizes = scene.rows("scales").mean(1)
     # No coordinate is off by more than a twentieth of the splat's size, but for the smallest thousandth of the splats.
-    needed = math.ceil(-(math.log2(2 * 0.05) + float(np.quantile(sizes, 0.001)) / math.log(2)))
+    needed, usual = map(math.ceil, -math.log2(2 * 0.05) - np.quantile(sizes, (0.001, 0.5)) / math.log(2))
     reach = np.abs(scene.means).max(1)
-    fits, mostly_fits = (_POSITION - 1 - math.frexp(end)[1] for end in (reach.max(), np.quantile(reach, 0.99)))
-    return min(max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits), 0), MAX_FRACTION)
+    fits, sky_fits, mostly_fits = (_POSITION - 1 - math.frexp(end)[1] for end in np.quantile(reach, (1, 0.999, 0.99)))
+    return int(min(max(min(needed, fits), min(_USUAL_FRACTION, mostly_fits, max(sky_fits, usual)), 0), MAX_FRACTION))
 
 
 def _packed(scene: CompressedScene, name: str, factor: float | Float32s, zero: float, clamped: Clamped) -> Uint8s:

@@ -252,6 +252,14 @@ def test_a_far_splat_does_not_make_spz_coarse(tmp_path: Path, caplog: pytest.Log
     assert back.means.max() == pytest.approx(2048, abs=0.01)
 
 
+def test_a_sky_of_half_a_percent_keeps_its_place_in_spz(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    scene = plain_scene(2000, 0)
+    scene.means[:10] = [3000, 0, 0]
+    back = arrays_of(read_scene_of(scene, tmp_path / "x.spz"))
+    assert not caplog.text
+    np.testing.assert_allclose(np.sort(back.means, 0), np.sort(scene.means, 0), atol=2**-12)
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_values_out_of_range_are_clamped_and_counted(
     tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture
