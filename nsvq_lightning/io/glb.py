@@ -200,7 +200,7 @@ def _splats(document: Json, data: memoryview, primitive: Json) -> CompressedScen
     rows = {
         "means": values("POSITION"),
         "quats": values(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
-        "scales": _logs_of_scale(values(f"{EXTENSION}:SCALE")),
+        "scales": logs_of_lengths(values(f"{EXTENSION}:SCALE")),
     }
     # In drafts, colours and opacities were those of the points.
     shown = values(OPACITY if OPACITY in names else "COLOR_0")
@@ -215,14 +215,6 @@ def _splats(document: Json, data: memoryview, primitive: Json) -> CompressedScen
     antialiased = isinstance(extras, dict) and extras.get("antialiased") is True
     points = _accessor(document, data, primitive["indices"])[:, 0] if "indices" in primitive else slice(None)
     return CompressedScene.from_rows(rows, antialiased=antialiased).take(points)
-
-
-def _logs_of_scale(scale: Arrays) -> Arrays:
-    """Logarithms ``[N, 3]`` of what SCALE holds: lengths, or, until the middle of 2026, their logarithms."""
-    if not (scale < 0).any():
-        return logs_of_lengths(scale)
-    log.warning("SCALE has negative numbers: taken as logarithms of lengths, which it was in drafts")
-    return scale
 
 
 def _accessor(document: Json, data: memoryview, number: int) -> Arrays:

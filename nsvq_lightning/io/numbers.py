@@ -30,7 +30,13 @@ def finite_logits(logits: Float32s) -> Float32s:
 
 
 def logits_of(opacities: Floats) -> Float32s:
-    """Logits of opacities of any shape: finite in [0, 1], otherwise NaN."""
+    """Logits of opacities of any shape: finite in [0, 1], otherwise NaN.
+
+    Where more than a hundredth are negative, all are logits already.
+    """
+    if (opacities < 0).sum() > 0.01 * opacities.size:
+        log.warning("opacities are negative: taken as logits")
+        return finite_logits(opacities.astype(np.float32))
     wide = opacities.astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         return finite_logits((np.log(wide) - np.log1p(-wide)).astype(np.float32))
@@ -52,10 +58,15 @@ def finite_logs(logs: Float32s) -> Float32s:
 
 
 def logs_of_lengths(lengths: Float32s) -> Float32s:
-    """Logarithms of axis lengths of any shape, :data:`FLAT` where there is no length; NaN and infinite ones stay."""
-    logs: Float32s = np.log(lengths.clip(np.finfo(np.float32).tiny))
-    logs[lengths <= 0] = FLAT
-    return logs
+    """Logarithms of axis lengths of any shape, :data:`FLAT` where there is no length; NaN and infinite ones stay.
+
+    Where more than a hundredth are negative, all are logarithms already, as in ``.glb`` until the middle of 2026.
+    """
+    if (lengths < 0).sum() > 0.01 * lengths.size:
+        log.warning("scales are negative numbers: taken as logarithms of lengths")
+        return lengths
+    with np.errstate(divide="ignore"):
+        return finite_logs(np.log(lengths.clip(np.float32(0))))
 
 
 # What float32 rounding may add to a distance of one half.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from viewer_scenes import plain_scene
 
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.formats import read_scene, save
+from nsvq_lightning.io.formats import load, read_scene, save
 from nsvq_lightning.io.nsvq.precision import Storage
 from nsvq_lightning.io.placing import cropped
 
@@ -61,6 +61,15 @@ def test_activations_instead_of_logits_are_told(caplog: pytest.LogCaptureFixture
     CompressedScene.from_splats(rows)
     assert not caplog.text
     CompressedScene.from_splats(rows | {"opacities": rows["opacities"].sigmoid()})
+    assert "all opacities are in [0, 1]: logits are expected" in caplog.text
+
+
+def test_a_file_of_activations_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    scene = plain_scene(20, 1)
+    scene.opacities[:] = 1 / (1 + np.exp(-scene.opacities))
+    save(scene, tmp_path / "x.ply")
+    caplog.clear()
+    load(tmp_path / "x.ply")
     assert "all opacities are in [0, 1]: logits are expected" in caplog.text
 
 

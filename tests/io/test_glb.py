@@ -183,10 +183,13 @@ def test_lengths_that_are_logarithms_are_known_by_their_sign(tmp_path: Path, cap
     document, data = parts(tmp_path / "x.glb")
     logs = scene.values("scales").copy()
     logs[3, 2] = -np.inf
+    data = replaced(document, data, f"{NAME}:OPACITY", scene.opacities)
     back = read_scene(write(tmp_path / "y.glb", document, replaced(document, data, f"{NAME}:SCALE", logs)))
     logs[3, 2] = -20.0
     np.testing.assert_allclose(back.values("scales"), logs, rtol=1e-6)
     assert "taken as logarithms" in caplog.text
+    np.testing.assert_array_equal(back.opacities, scene.opacities)
+    assert "taken as logits" in caplog.text
 
 
 def test_names_of_drafts_are_known(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -119,6 +119,16 @@ def test_linear_light_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) 
     assert "linear light" in caplog.text
 
 
+def test_lengths_that_are_logarithms_are_known_by_their_sign(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    plain = _changed(tmp_path / "x.usda", str)
+    logs = plain.values("scales")
+    assert (logs < 0).any()
+    text = ", ".join(f"({', '.join(map(str, row))})" for row in logs.tolist())
+    found = _changed(tmp_path / "y.usda", lambda old: re.sub(r"scales = \[[^\]]*\]", f"scales = [{text}]", old))
+    np.testing.assert_allclose(found.values("scales"), logs, atol=1e-6)
+    assert "taken as logarithms" in caplog.text
+
+
 def test_axes_and_unit_of_the_stage(tmp_path: Path) -> None:
     """Oracle: by hand. With z up, y points away; ours points down, and away is z."""
     plain = _changed(tmp_path / "x.usda", str)
