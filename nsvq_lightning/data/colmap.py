@@ -259,8 +259,8 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
         check_name(row.name, files["images"], allow_outside=True)
         if row.camera_id not in cameras:
             raise SceneError(
-                f"{files['images']}: photo {row.name} is of camera {row.camera_id}, which {files['cameras'].name} does "
-                "not have: copy both files again, from one model"
+                f"{files['images']}: photo {row.name[:80]} is of camera {row.camera_id}, which "
+                f"{files['cameras'].name} does not have: copy both files again, from one model"
             )
     points = tables.PointTable(np.zeros((0, 3)), np.zeros((0, 3)), ())
     if "points3D" in files:

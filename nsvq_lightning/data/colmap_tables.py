@@ -239,7 +239,7 @@ def _image_lines(path: Path) -> Iterator[ImageRow]:
     after_image = False
     for line, text in _lines(path):
         words = text.split(maxsplit=9)
-        if after_image and re.fullmatch(r"[-+.\deE\s]+", text) and len(text.split()) % 3 == 0:
+        if after_image and re.fullmatch(r"[-+.\deEnaifd()\s]+", text) and len(text.split()) % 3 == 0:
             after_image = False
             continue
         if len(words) < 10:

@@ -243,7 +243,7 @@ _POINT_ASTRAY = 100
 _AT_CAMERA = 1e-6
 # Cameras that are so near to each other, over the distance of points from them, are in one place.
 _NO_PARALLAX = 1e-4
-ONE_PLACE = "are taken from one place: without parallax there is no depth; move while taking photos"
+ONE_PLACE = "are taken from one place, or points are in other coordinates: no depth shows; move while taking photos"
 
 
 def load_scene(
@@ -435,7 +435,7 @@ def _image_sources(
 def _odd_lens(number: int, lens: Pinhole, size: tuple[int, int]) -> list[str]:
     """What numbers lenses hardly have, or that undistortion leaves less than half of photos of a size, if so."""
     (fx, _, cx), (_, fy, cy) = lens.K[:2].tolist()
-    is_usual = 0.5 < fx / fy < 2 and 0.1 < cx / lens.width < 0.9 and 0.1 < cy / lens.height < 0.9
+    is_usual = 0.5 * fy < fx < 2 * fy and 0.1 < cx / lens.width < 0.9 and 0.1 < cy / lens.height < 0.9
     is_usual &= 0.1 < fx / lens.width < 20  # pixels, not millimetres
     if is_usual and 2 * lens.width * lens.height >= math.prod(size):
         return []
@@ -557,7 +557,7 @@ def usable(scene: Scene) -> Scene:
         scene = replace(scene, train=train, test=test)
     if is_elsewhere(scene):
         log.warning(f"the points of {scene.root} {ELSEWHERE}; random ones take their place")
-        return scene.with_random_points()
+        return replace(scene.with_random_points(), extent=EXTENT * scene.frame.unit)
     return scene
 
 
@@ -613,7 +613,8 @@ def _camera(image: ColmapImage, lens: Pinhole, near: float) -> Camera:
     try:
         return Camera(torch.from_numpy(lens.K), pose, lens.width, lens.height, near).to(dtype=torch.float32)
     except ValueError as error:
-        raise SceneError(f"camera {image.camera_id} of image {image.name}: {error}; run COLMAP again") from error
+        camera = f"camera {image.camera_id} of image {image.name}"
+        raise SceneError(f"{camera}: {error}; run COLMAP again, or give angles in radians") from error
 
 
 # High-pass value, of grey values up to 255, from which a pixel counts as detailed: well above the noise of a photo. In

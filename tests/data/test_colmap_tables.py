@@ -105,7 +105,9 @@ def test_labels_with_numbers_are_no_points(tmp_path: Path) -> None:
 
 def test_points_of_images_may_have_identifiers_with_decimals(tmp_path: Path) -> None:
     path = tmp_path / "images.txt"
-    path.write_text("".join(f"{number} {POSE} 1 {number}.jpg\n" + "3.5 4.5 -1.0 " * 4 + "\n" for number in (1, 2)))
+    path.write_text(
+        "".join(f"{number} {POSE} 1 {number}.jpg\n" + "3.5 -nan(ind) -1.0 " * 4 + "\n" for number in (1, 2))
+    )
     assert [image.name for image in read_images(path)] == ["1.jpg", "2.jpg"]
 
 

@@ -24,7 +24,7 @@ from transforms_scenes import write_blender, write_nerfstudio
 from nsvq_lightning.data import scene as scene_module
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_models
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.data.images import ImageHead, Picture
+from nsvq_lightning.data.images import ImageHead, Picture, same_shape
 from nsvq_lightning.data.photo_files import photos_below
 from nsvq_lightning.data.points import RANDOM_POINTS, in_picture, projected
 from nsvq_lightning.data.reconstruct import reconstruct
@@ -43,7 +43,7 @@ from nsvq_lightning.data.scene import (
 from nsvq_lightning.data.transforms import read_poses
 from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.rendering.camera import Camera, camera_of
-from nsvq_lightning.rendering.frame import Frame
+from nsvq_lightning.rendering.frame import EXTENT, Frame
 from nsvq_lightning.rendering.poses import view_from
 from nsvq_lightning.training.module import SplatModule
 
@@ -109,6 +109,12 @@ def test_numbers_that_no_lens_has_are_told(
 ) -> None:
     load_scene(make_scene(model=model, params=params))
     assert ("camera 1 is odd: focal lengths " in caplog.text) == is_odd
+
+
+def test_a_focal_length_of_zero_is_refused(make_scene: SceneFactory) -> None:
+    root = make_scene(model="PINHOLE", params=(30.0, 0.0, 21.0, 15.0))
+    with pytest.raises(SceneError, match=r"camera 1 of image .*: Camera\.K needs positive, finite focal lengths"):
+        load_scene(root)
 
 
 def test_what_is_far_from_all_others_is_named(
@@ -396,6 +402,7 @@ def test_points_that_are_not_where_photos_show_them_make_way(
     found = usable(scene)
     assert (found.grey, ("are not where the photos show their colours" in caplog.text)) == (wrong, wrong)
     assert (len(found.points) == RANDOM_POINTS) == wrong
+    assert found.extent == pytest.approx(EXTENT * found.frame.unit)  # also where points are too far for parallax
     if wrong:
         assert seen_by(found.train_cameras, found.points.numpy()).any(0).mean() > 0.9
 
@@ -547,6 +554,12 @@ def test_masks_of_any_levels_and_sizes(
     mask = cv2.resize(np.where(HALF > 0, np.uint8(levels[1]), np.uint8(levels[0])), size, interpolation=0)
     write_masks(root, ["000.png", "001.png"], mask)
     assert torch.equal(mask_of(root, 0), KEPT)
+
+
+def test_masks_of_full_size_fit_photos_that_were_rounded() -> None:
+    assert same_shape((194, 130), (25, 16))
+    assert same_shape((25, 17), (25, 16))
+    assert not same_shape((194, 130), (25, 12))
 
 
 def test_a_pixel_counts_only_if_all_that_it_is_made_of_counts(make_scene: SceneFactory) -> None:
