@@ -80,8 +80,8 @@ def is_cut(one: Size, other: Size) -> bool:
 
 
 def same_shape(one: Size, other: Size) -> bool:
-    """Whether two sizes (width, height) have one aspect ratio, up to rounding of a side to a pixel of the first."""
-    return abs(one[0] * other[1] - one[1] * other[0]) < max(ROUNDED * one[1] * other[0], *other)
+    """Whether two sizes (width, height) have one aspect ratio, up to rounding of a side to a pixel of either."""
+    return abs(one[0] * other[1] - one[1] * other[0]) <= max(ROUNDED * one[1] * other[0], *one, *other)
 
 
 def is_transparent(path: Path) -> bool:

@@ -14,7 +14,7 @@ from nsvq_lightning.top_level import log
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 # What names of folders of masks have in them.
-_OF_MASKS = re.compile("(?<!un)mask", re.IGNORECASE)
+_OF_MASKS = re.compile("(?<!un)mask|^(alpha|matte)s?$", re.IGNORECASE)
 # The same of folders whose pictures are no photos, unless a model names them.
 _NO_PHOTOS = re.compile(f"{_OF_MASKS.pattern}|depth|normal", re.IGNORECASE)
 
@@ -123,7 +123,7 @@ def _kind(name: str) -> str:
 def photos_below(folder: Path, suffixes: Sequence[str] = PHOTOS) -> list[Path]:
     """The files in a folder and the folders in it, linked ones too, that end as photos do, sorted."""
     found = map(folder.joinpath, glob("**", root_dir=folder, recursive=True, include_hidden=True))
-    return sorted(path for path in found if path.suffix.lower() in suffixes and path.is_file())
+    return sorted(path for path in found if path.suffix.lower() in suffixes and path.name[0] != "." and path.is_file())
 
 
 def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]) -> tuple[Path, int]:
@@ -205,7 +205,7 @@ def find_masks(
     elif shown and not has_own:
         name = Path(relative[0])
         png = name.with_suffix(".png")
-        log.warning(f"{shown} has no mask of any photo: that of {name} would be {name}.png or {png}")
+        log.warning(f"{shown} has no mask of any photo: that of {name} would be {name}.png or {png}; not used")
     elif not places and not has_own:
         log.warning(f"there is no folder {root / folders[-1]}: no photo has a mask")
     elif any(path.name.startswith("dynamic_mask_") for path in photos.glob("*")):

@@ -58,7 +58,7 @@ def cloud_in(folders: list[Path]) -> Path | None:
         SceneError: There are several.
     """
     for folder in folders:
-        files = sorted(path for path in folder.glob("*") if path.suffix.lower() == ".ply")
+        files = sorted(path for path in folder.glob("[!.]*") if path.suffix.lower() == ".ply")
         usual = [path for path in files if path.stem.lower() in _CLOUDS] or files
         if len(usual) > 1:
             raise SceneError(f"{usual[0]} and {usual[1]} may be the points to start from: leave one of them there")

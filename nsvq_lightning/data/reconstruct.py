@@ -144,7 +144,7 @@ def reconstruct(
 
 _NOTHING_IN_COMMON = (
     "no two photos show enough of the same things from different places; each should overlap the next by two thirds, "
-    "be sharp, and show texture"
+    "be sharp, and show texture; the camera must move, not the object, or masks leave out what stands still"
 )
 
 
@@ -398,7 +398,7 @@ def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
         SceneError: There are none.
     """
     suffixes = PHOTOS + CONVERTED + RAW
-    files = [path for path in photos_below(folder, suffixes) if not path.name.startswith(".")]
+    files = photos_below(folder, suffixes)
     other = {path for path in files if _is_other(path.relative_to(folder))}
     files.sort(key=lambda path: (path in other, path.parent != folder, suffixes.index(path.suffix.lower()), path))
     taken: dict[str, Path] = {}

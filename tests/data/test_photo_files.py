@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nsvq_lightning.data.colmap import ColmapImage, NoPhotosError, SceneError
-from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder
+from nsvq_lightning.data.photo_files import find_masks, locate, photo_folder, photos_below
 
 
 def write(root: Path, *names: str) -> None:
@@ -122,6 +122,7 @@ def test_the_only_folder_that_has_the_photos_is_used(tmp_path: Path, place: str)
         "images_masks/mask_{}.PNG",
         "images/masks/{}.png",
         "dense/0/masks/{}.jpg.png",
+        "alpha/{}.png",
     ],
 )
 def test_masks_are_found_in_the_only_place_that_has_some(
@@ -149,6 +150,11 @@ def test_a_mask_of_what_a_photo_was_converted_from_is_its_own(tmp_path: Path) ->
         tmp_path / "masks/1.HEIC.png",
         tmp_path / "masks/2.avif.png",
     ]
+
+
+def test_what_a_mac_leaves_beside_photos_is_none(tmp_path: Path) -> None:
+    write(tmp_path, "images/1.jpg", "images/._1.jpg", "images/.hidden/2.jpg")
+    assert photos_below(tmp_path) == [tmp_path / "images/.hidden/2.jpg", tmp_path / "images/1.jpg"]
 
 
 def test_a_photo_is_no_mask(tmp_path: Path) -> None:

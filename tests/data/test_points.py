@@ -9,7 +9,7 @@ import pytest
 
 from nsvq_lightning.compression.viewpoints import look_at
 from nsvq_lightning.data.colmap import SceneError
-from nsvq_lightning.data.points import random_points, read_points, share_seen
+from nsvq_lightning.data.points import cloud_in, random_points, read_points, share_seen
 from nsvq_lightning.data.scene import load_scene
 
 
@@ -33,6 +33,13 @@ def test_binary_point_clouds(tmp_path: Path, order: str) -> None:
         path.write_bytes(whole[:length])
         with pytest.raises(SceneError, match=r"points .*points\.ply: .*copy the file again"):
             read_points(path)
+
+
+def test_what_a_mac_leaves_beside_files_is_no_cloud(tmp_path: Path) -> None:
+    (tmp_path / "._scan.ply").write_bytes(b"\0\5\x16\7")
+    assert cloud_in([tmp_path]) is None
+    (tmp_path / "scan.ply").write_text("ply")
+    assert cloud_in([tmp_path]) == tmp_path / "scan.ply"
 
 
 def test_points_without_colours_are_grey_and_short_files_are_refused(tmp_path: Path) -> None:
