@@ -233,8 +233,8 @@ class SplatCLI(LightningCLI):
                 reserve(self.trainer, self.config[subcommand].get("ckpt_path") if fits else None)
             except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
                 raise OSError(
-                    f"the folder of the run, {error.filename}, cannot be made ({error.strerror}): name another one "
-                    "with --trainer.run_folder, or none for a new one in runs/"
+                    f"the folder of the run, {error.filename}, cannot be made ({error.strerror}): close what "
+                    "holds it open, or name another one with --trainer.run_folder, or none for a new one in runs/"
                 ) from error
         try:
             super()._run_subcommand(subcommand)

@@ -188,7 +188,7 @@ def _run_lightning(arguments: list[str], own_process: bool) -> int:
         "does not have many workers",  # views come from a cache in memory; each worker would hold a copy
         "args parameter is intended",  # we pass the arguments after looking up configs
         "dataloader.*no length",
-        "LeafSpec",
+        "(LeafSpec|GPU available but not used)",
         "(Checkpoint|Experiment logs) directory .* exists and is not empty",  # the marker of who writes there
         "`tensorboardX` has been removed",
         "Couldn't infer the batch indices",  # RenderWriter names pictures after their photos
@@ -288,6 +288,6 @@ def _quiet_lightning() -> None:
         handler.addFilter(lambda record: record.levelno >= logging.WARNING or getattr(rank_zero_only, "rank", 0) == 0)
 
     # Fragments of Lightning's messages that advertise, or repeat the progress bar in the middle of its line.
-    not_ours = ("Tip:", "PU available: False", "litlogger", "litmodels", "`Trainer.fit` stopped")
+    not_ours = ("Tip:", "PU available:", "litlogger", "litmodels", "`Trainer.fit` stopped")
     for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
         logging.getLogger(name).addFilter(lambda record: not any(part in record.getMessage() for part in not_ours))

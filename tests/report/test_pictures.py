@@ -4,9 +4,11 @@ import logging
 import os
 import re
 import shutil
+import tempfile
 import unicodedata
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -51,6 +53,19 @@ def test_pictures_come_back_from_the_video(tmp_path: Path, codec: str, caplog: p
     for frame, picture in zip(frames, _pictures(), strict=True):
         assert np.abs(frame - picture).mean() < 4
     assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_a_video_behind_a_link_is_made_where_that_leads(tmp_path: Path, codec: str) -> None:
+    (tmp_path / "far:1").mkdir()
+    (tmp_path / "a.mp4").symlink_to("far:1/b.mp4")
+    with (
+        mock.patch.object(pictures.tempfile, "TemporaryDirectory", wraps=tempfile.TemporaryDirectory) as made,
+        video_writer(tmp_path / "a.mp4", 64, 48, 12.0) as add,
+    ):
+        add(_pictures()[0])
+    assert made.call_args.kwargs["dir"] == tmp_path / "far:1"
+    assert (tmp_path / "a.mp4").is_symlink()
+    assert len(_frames(tmp_path / "far:1" / "b.mp4")) == 1
 
 
 def test_what_opencv_could_not_write_is_no_video(tmp_path: Path, codec: str, monkeypatch: pytest.MonkeyPatch) -> None:
