@@ -154,6 +154,7 @@ class Compressor:
         steps: Steps of a training, at least 4; None as many as the minutes allow, at most :data:`USUAL_STEPS`, or
             :data:`THINNING` times as many.
         stopped: Whether Ctrl-C has ended a training before its end.
+        begun: Whether a training is done, so that Ctrl-C need not lose all.
     """
 
     scene: CompressedScene
@@ -164,6 +165,7 @@ class Compressor:
     minutes: float = math.inf
     steps: int | None = None
     stopped: bool = field(default=False, init=False)
+    begun: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         self._splats = self.scene.tensors()
@@ -361,6 +363,18 @@ class Compressor:
         return best
 
     def _train(self, setting: Setting) -> CompressedScene:
+        """Select and quantize splats, and train what is left; in a few steps if Ctrl-C comes after other trainings."""
+        try:
+            found = self._train_once(setting)
+        except KeyboardInterrupt:
+            if self.stopped or not self.begun:
+                raise
+            self.stopped = True
+            found = self._train_once(setting)
+        self.begun = True
+        return found
+
+    def _train_once(self, setting: Setting) -> CompressedScene:
         """Select and quantize splats, and train what is left."""
         sizes = {} if setting.codebooks == "none" else attributes.codebook_sizes(setting.codebooks)
         if "shN" in sizes:
@@ -415,13 +429,13 @@ class Compressor:
         It is trained on pictures of it alone: from cameras of the scene that show it, or from guessed ones. The minutes
         are for a million splats.
         """
-        found = []
+        found: list[CompressedScene] = []
         for number, rows in enumerate(np.array_split(spatial_order(self.scene.means), self.parts)):
             log.info(f"part {number + 1} of {self.parts}")
             part = self.scene.take(rows)
             cameras = viewpoints.showing(self._known, part.means, viewpoints.VIEWS)
             own = Compressor(part, cameras, None, self.storage, self.seed, self.minutes * len(part) / 1e6, self.steps)
-            own.stopped = self.stopped
+            own.stopped, own.begun = self.stopped, bool(found)
             left = max(1, setting.splats * len(part) // len(self.scene))
             found.append(own._train(setting._replace(splats=left)))
             self.stopped = own.stopped

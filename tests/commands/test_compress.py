@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -130,6 +131,32 @@ def test_ctrl_c_ends_all_levels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert main(["compress", str(tmp_path / "scene.ply"), str(output), "--levels=3", "--steps=50"]) == 130
     assert list(ends.values()) == [30, 4]  # the finest level needs no training
     assert len(read_scene(output)) == 2000
+
+
+@pytest.mark.parametrize("parts", [1, 4])
+def test_ctrl_c_before_the_codebooks_of_a_later_training_keeps_the_earlier_ones(
+    parts: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from nsvq_lightning.callbacks import CodebookInit
+    from nsvq_lightning.compression import compressor
+
+    begin, begun = CodebookInit.before_step, []
+
+    def interrupted(callback: CodebookInit, trainer: Any, module: Any, *args: Any) -> None:
+        begun.append(trainer)
+        if len(set(begun)) == 2 and begun.count(trainer) == 1:
+            raise KeyboardInterrupt
+        begin(callback, trainer, module, *args)
+
+    monkeypatch.setattr(CodebookInit, "before_step", interrupted)
+    monkeypatch.setattr(compressor, "AT_ONCE", 2000 // parts)
+    write_ply(tmp_path / "scene.ply", ball(2000))
+    output = tmp_path / "x.nsvq"
+    aim = "--codebooks=0.5k" if parts > 1 else "--target-bytes=24000"
+    assert main(["compress", str(tmp_path / "scene.ply"), str(output), aim, "--steps=50"]) == 130
+    assert len(read_nsvq(output)) == 2000
+    assert len(set(begun)) == max(3, parts + 1)  # the second one again, in a few steps
+    assert "ended the training early" in capsys.readouterr().err
 
 
 def test_ctrl_c_before_there_are_codebooks_is_no_other_error(
