@@ -25,7 +25,7 @@ from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
-from nsvq_lightning.data.images import DAMAGED, ImageHead, exif_of, read_image, read_mask, write_pixels
+from nsvq_lightning.data.images import DAMAGED, ImageHead, exif_of, is_transparent, read_image, read_mask, write_pixels
 from nsvq_lightning.data.photo_files import PHOTOS, masks_in, photos_below
 from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
 from nsvq_lightning.top_level import log
@@ -216,11 +216,16 @@ def _extract(scene: Path, photos: Heads, report: Report, max_size: int, threads:
 def _write_masks(scene: Path, photos: Heads, folder: Path) -> dict[str, int]:
     """Write the masks of a scene as COLMAP takes them, one for each photo and of its size; returns their checksums.
 
+    What is transparent in a photo does not count either, as in training.
+
     Raises:
         SceneError: A mask is damaged or of another shape, or two fit a photo.
     """
-    names = [(name, name) for name in photos]
-    found = masks_in(scene / "masks", names, [scene / "images" / name for name in photos], beside=False)
+    files = [scene / "images" / name for name in photos]
+    found = masks_in(scene / "masks", [(name, name) for name in photos], files, beside=False)
+    for number, (file, head) in enumerate(zip(files, photos.values(), strict=True)):
+        if not found[number] and head.has_alpha and is_transparent(file):
+            found[number] = file
     sums: dict[str, int] = {}
     for (name, head), mask in zip(photos.items(), found if any(found) else (), strict=False):
         counts = read_mask(mask, head.size) if mask else np.ones(head.size[::-1], np.bool_)

@@ -350,6 +350,22 @@ def test_masks_are_written_as_colmap_takes_them(tmp_path: Path) -> None:
     assert (written[1] == 255).all()
 
 
+def test_what_is_transparent_is_masked(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    pixels = np.zeros((30, 40, 4), np.uint8)
+    pixels[..., 3] = 255
+    PIL.Image.fromarray(pixels).save(tmp_path / "images" / "a.png")  # all of it is opaque, and black
+    heads = {"a.png": image_head(tmp_path / "images" / "a.png")}
+    assert reconstruct._write_masks(tmp_path, heads, tmp_path / "kept") == {}
+    pixels[:10, :, 3] = 0
+    PIL.Image.fromarray(pixels).save(tmp_path / "images" / "b.png")
+    heads["b.png"] = image_head(tmp_path / "images" / "b.png")
+    assert set(reconstruct._write_masks(tmp_path, heads, tmp_path / "kept")) == set(heads)
+    written = [np.asarray(PIL.Image.open(tmp_path / "kept" / f"{name}.png")) for name in heads]
+    assert (written[0] == 255).all()
+    np.testing.assert_array_equal(written[1], pixels[..., 3])
+
+
 def test_copies_in_folders_keep_their_names(folders: tuple[Path, Path]) -> None:
     source, target = folders
     for name in ("left/1.png", "right/1.webp"):
