@@ -157,7 +157,8 @@ def oddities(photos: Heads) -> Iterator[str]:
     if len(photos) <= 3:
         yield f"{len(photos)} photos are hardly enough for a scene: take 50 to 300 from different places"
     wide = [name for name, head in photos.items() if head.size[0] == 2 * head.size[1]]
-    if 2 * len(wide) > len(photos):
+    # A few thumbnails, or pictures for the web, may be cut so; larger ones among photos bend the cameras of all.
+    if 2 * len(wide) > len(photos) or any(photos[name].size[0] >= 1000 for name in wide):
         yield (
             f"{some(wide)} are twice as wide as high: 360° panoramas must be cut into ordinary views first, for "
             "example with 'ffmpeg -i panorama.jpg -vf v360=e:flat:yaw=90 view.jpg' for each direction"

@@ -391,6 +391,9 @@ def test_panoramas_and_few_photos_have_their_own_words() -> None:
     assert list(oddities({"a.png": wide, "b.png": wide, "c.png": usual, "d.png": usual})) == []  # a few may be cut so
     (said,) = oddities({"a.png": wide, "b.png": wide, "c.png": usual, "d.png": wide})
     assert "twice as wide as high: 360° panoramas must be cut" in said
+    large = ImageHead((1024, 512), 1, has_alpha=False)
+    (said,) = oddities({"a.png": usual, "b.png": usual, "c.png": usual, "d.png": usual, "e.png": large})
+    assert said.startswith("e.png are twice as wide as high: 360° panoramas must be cut")
     (said,) = oddities({"c.png": usual, "d.png": usual, "e.png": usual})
     assert said.startswith("3 photos are hardly enough")
 
