@@ -3,9 +3,11 @@
 import ctypes
 import gc
 import math
+import re
 import threading
 import weakref
 from contextlib import suppress
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,8 +15,6 @@ import torch
 from torch import Tensor
 
 Array = np.ndarray[Any, np.dtype[Any]]
-
-FLOAT32, INT32, INT64, UINT8, UINT64 = map(np.dtype, (np.float32, np.int32, np.int64, np.uint8, np.uint64))
 
 # Memory that is free.
 _FREE: list[Array] = []
@@ -24,46 +24,6 @@ _IDLE: list["Workspace"] = []
 def flat(tensor: Tensor) -> Array:
     """The elements of a CPU tensor in row-major order: its own memory, or a copy where that is not contiguous."""
     return tensor.detach().ravel().numpy()
-
-
-def check_array(name: str, array: Array, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-    """Refuse memory that a kernel would misread or run past the end of.
-
-    Args:
-        name: What the error calls it.
-        array: What a kernel is to read or write.
-        shape: The shape it must have.
-        dtype: The dtype it must have.
-
-    Raises:
-        TypeError: It is not an array, or has another dtype.
-        ValueError: It has another shape, or is not contiguous.
-    """
-    if not isinstance(array, np.ndarray) or array.dtype != dtype:
-        raise TypeError(f"{name} must be {dtype}, got {getattr(array, 'dtype', type(array).__name__)}; convert it")
-    if array.shape != shape:
-        raise ValueError(f"{name} must have shape {list(shape)}, got {list(array.shape)}")
-    if not array.flags.c_contiguous:
-        raise ValueError(f"{name} must be contiguous, got strides {array.strides}; pass a copy")
-
-
-def check_table(name: str, table: Array) -> None:
-    """Refuse anything but a float32 table ``[N, D]`` with D > 0 (:func:`check_array`).
-
-    Raises:
-        TypeError: It is not float32.
-        ValueError: It has another shape, or is not contiguous.
-    """
-    check_array(name, table, table.shape, FLOAT32)
-    if table.ndim != 2 or table.shape[1] == 0:
-        raise ValueError(f"{name} must have shape [N, D] with D > 0, got {list(table.shape)}")
-
-
-def flat_checked(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: np.dtype[Any] = FLOAT32) -> Array:
-    """The memory of a tensor on the CPU, row by row, after :func:`check_array`."""
-    array = tensor.detach().numpy()
-    check_array(name, array, shape, dtype)
-    return array.ravel()
 
 
 def check_inside(name: str, numbers: Array | Tensor, count: int, least: int = 0) -> None:
@@ -147,28 +107,46 @@ def recycled(shape: tuple[int, ...]) -> Tensor:
     return torch.from_numpy(view)
 
 
-def check_tensor(
-    name: str, tensor: Tensor, shape: tuple[int, ...], device: torch.device, dtype: torch.dtype = torch.float32
-) -> None:
+# Dimensions that are given as numbers.
+_NUMBERS = {str(number): number for number in range(32)}
+
+
+@cache
+def _forms(text: str) -> list[tuple[str, list[str], str, set[Any]]]:
+    """Name, dimensions and dtype of each array in a text as :func:`check_fit` takes it."""
+    forms = []
+    for name, dims, dtype in re.findall(r"([^,]+?) \[(.*?)\](?: (\w+))?(?:, |$)", text):
+        kind = dtype or "float32"
+        forms.append((name, re.findall(r"\w+", dims), kind, {getattr(torch, kind), np.dtype(kind)}))
+    return forms
+
+
+def check_fit(text: str, first: Array | Tensor, *others: Array | Tensor | None, **sizes: int) -> None:
     """Refuse memory that a kernel would misread or run past the end of; asks nothing of the device.
 
     Args:
-        name: What the error calls it.
-        tensor: What a kernel is to read or write.
-        shape: The shape it must have.
-        device: Where it must be.
-        dtype: The dtype it must have.
+        text: What arrays or tensors have to be, such as ``x [N, D], codes [N] int64``: their names for the error, their
+            dimensions, of which equal ones have the same name, and the dtype if it is not float32.
+        first: The first of them.
+        others: The others in this order, of which the last ones may be left out. Those that are None fit.
+        sizes: Dimensions that are known, by name.
 
     Raises:
-        TypeError: It has another dtype.
-        ValueError: It has another shape, is on another device, or is not contiguous.
+        TypeError: One has another dtype.
+        ValueError: One has another shape, is on another device than the first, or is not contiguous.
     """
-    if tensor.dtype != dtype:
-        raise TypeError(f"{name} must be {dtype}, got {tensor.dtype}; convert it")
-    if tensor.shape != shape or tensor.device != device:
-        raise ValueError(f"{name} needs shape {list(shape)} on {device}, got {list(tensor.shape)} on {tensor.device}")
-    if not tensor.is_contiguous():
-        raise ValueError(f"{name} must be contiguous, got strides {tensor.stride()}; pass a copy")
+    known: dict[str, int] = _NUMBERS | sizes
+    for (name, dims, kind, dtypes), each in zip(_forms(text), (first, *others), strict=False):
+        if each is None:
+            continue
+        if each.dtype not in dtypes:
+            raise TypeError(f"{name} must be {kind}, got {each.dtype}; convert it")
+        shape = tuple(map(known.setdefault, dims, each.shape))
+        if len(dims) != each.ndim or shape != each.shape or each.device != first.device:
+            expected = f"[{', '.join(dims)}] = {list(shape)} on {first.device}"
+            raise ValueError(f"{name} must have shape {expected}, got {list(each.shape)} on {each.device}")
+        if not (each.is_contiguous() if isinstance(each, Tensor) else each.flags.c_contiguous):
+            raise ValueError(f"{name} must be contiguous; pass a copy")
 
 
 def aligned_empty(shape: tuple[int, ...]) -> Array:

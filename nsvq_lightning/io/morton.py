@@ -5,7 +5,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from nsvq_lightning.compute.jit import inline, kernel
-from nsvq_lightning.compute.memory import INT64, UINT64, check_array, check_inside
+from nsvq_lightning.compute.memory import check_fit
 from nsvq_lightning.io.numbers import power_above, power_below
 from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int32s, Int64s, Integers, Uint64s
 
@@ -74,14 +74,7 @@ class Grid(NamedTuple):
 
 
 def morton_keys(cells: Int64s, depths: Int64s) -> Uint64s:
-    """Interleaved bits of coordinates ``[N, 3]``, highest first, x before y before z; those below ``depths`` are 0.
-
-    Raises:
-        ValueError: The arrays are not ``[N, 3]`` and ``[N]``, or not contiguous, or a depth is not in 0 to 21.
-        TypeError: They are not int64.
-    """
-    check_array("cells", cells, (len(depths), 3), INT64)
-    check_depths(depths, AXIS_BITS)
+    """Interleaved bits of coordinates ``[N, 3]``, highest first, x before y before z; those below ``depths`` are 0."""
     shift = AXIS_BITS - depths
     keys = np.zeros(len(cells), np.uint64)
     for axis in range(3):
@@ -93,20 +86,8 @@ def morton_keys(cells: Int64s, depths: Int64s) -> Uint64s:
     return keys
 
 
-def check_depths(depths: Int64s, largest: int) -> None:
-    """Refuse depths that are not ``[N]`` contiguous int64 in 0 to ``largest``."""
-    check_array("depths", depths, (depths.size,), INT64)
-    check_inside("depths", depths, largest + 1)
-
-
 def unmorton(keys: Uint64s) -> Int64s:
-    """Coordinates ``[N, 3]`` of keys ``[N]``.
-
-    Raises:
-        ValueError: ``keys`` is not contiguous.
-        TypeError: They are not uint64.
-    """
-    check_array("keys", keys, (len(keys),), UINT64)
+    """Coordinates ``[N, 3]`` of keys ``[N]``."""
     cells = np.empty((len(keys), 3), np.int64)
     for axis in range(3):
         bits = keys >> (2 - axis) & _MASKS[0]
@@ -125,7 +106,7 @@ def nearest_before(cells: Int64s) -> Int32s:
         ValueError: ``cells`` is not ``[N, 3]``, or not contiguous.
         TypeError: It is not int64.
     """
-    check_array("cells", cells, (len(cells), 3), INT64)
+    check_fit("cells [N, 3] int64", cells)
     found = np.empty((len(cells), 2), np.int32)
     _search_before(np.ascontiguousarray(cells.T, np.float64), found)
     return found

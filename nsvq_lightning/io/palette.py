@@ -5,7 +5,6 @@ from heapq import heappop, heappush
 import numpy as np
 
 from nsvq_lightning.compute.jit import inline, kernel
-from nsvq_lightning.compute.memory import check_array, check_table
 from nsvq_lightning.splats.conventions import Arrays, Float32s, Float64s, Int64s, Integers, Uint8s
 
 
@@ -24,14 +23,8 @@ def find_palette(rows: Float32s, weight: Arrays, count: int) -> tuple[Float32s, 
 
     Returns:
         The mean of each cell ``[K, D]`` with K at most ``count``, and the cell of each row ``[N]``.
-
-    Raises:
-        TypeError: ``rows`` are not float32.
-        ValueError: They have another shape, are not contiguous, or the number of weights differs.
     """
-    check_table("rows", rows)
-    wide = weight.astype(np.float64)
-    check_array("weight", wide, rows.shape[:1], wide.dtype)
+    wide = np.broadcast_to(weight, len(rows)).astype(np.float64)
     order = np.arange(len(rows))
     # Of each cell: how much less the sum of squares is if it is cut, negative; start, cut, end.
     heap: list[tuple[float, int, int, int]] = []

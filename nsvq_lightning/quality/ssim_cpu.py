@@ -13,11 +13,11 @@ from torch import Tensor
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
-from nsvq_lightning.compute.memory import FLOAT32, UINT8, Workspace, flat, flat_checked, recycled
+from nsvq_lightning.compute.memory import Workspace, check_fit, flat, recycled
 from nsvq_lightning.compute.rows import clear, share
 from nsvq_lightning.compute.simd import fma, get, load, put, store
 from nsvq_lightning.quality import formulas
-from nsvq_lightning.quality.formulas import DERIVATIVES, MOMENTS, SSIM_RADIUS, check_pair, ssim_window
+from nsvq_lightning.quality.formulas import DERIVATIVES, MOMENTS, SSIM_RADIUS, ssim_window
 
 # The taps of the window, from the middle outwards.
 TAPS = tuple(F(tap) for tap in ssim_window()[SSIM_RADIUS:].tolist())
@@ -186,18 +186,16 @@ def fused_loss(
         ValueError: The shapes differ or are not ``[H, W, 3]``, W is below 6, or a picture is not contiguous.
         TypeError: A dtype is wrong.
     """
-    check_pair(image, target)
-    height, width = image.shape[:2]
+    of_bytes = target.dtype == torch.uint8
+    check_fit(f"image [H, W, 3], target [H, W, 3] {'uint8' if of_bytes else 'float32'}", image, target)
+    height, width, _ = image.shape
     length = 3 * width
     if length < simd.WIDTH:
         raise ValueError(f"a row of the image must fill a vector, so its width must be at least 6, got {width}")
-    of_bytes = target.dtype == torch.uint8
-    shape = height, width, 3
-    pixels = flat_checked("image", image, shape)
-    wanted = flat_checked("target", target, shape, UINT8 if of_bytes else FLOAT32)
+    pixels, wanted = flat(image), flat(target)
     pitch = (length + 2 * PAD + 15) // 16 * 16
     threads = max(1, min(thread_count(), height // RING))
-    gradient = recycled(shape)
+    gradient = recycled(image.shape)
     work = Workspace.borrow()
     images = work.rows("images", threads, RING * IMAGES * pitch)
     moments = work.rows("moments", threads, MOMENTS * pitch)

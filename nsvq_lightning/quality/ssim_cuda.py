@@ -16,9 +16,9 @@ from triton.language import constexpr
 
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.formulas import for_triton
-from nsvq_lightning.compute.memory import check_tensor
+from nsvq_lightning.compute.memory import check_fit
 from nsvq_lightning.quality import formulas as shared
-from nsvq_lightning.quality.formulas import DERIVATIVES, MOMENTS, SSIM_RADIUS, check_pair, ssim_window
+from nsvq_lightning.quality.formulas import DERIVATIVES, MOMENTS, SSIM_RADIUS, ssim_window
 
 formulas = for_triton(shared)
 
@@ -195,16 +195,15 @@ def gradient_kernel(
     store_at(gradient, at, value * tl.load(scale))
 
 
-def _launch(image: Tensor, target: Tensor) -> tuple[tuple[int, int], tuple[int, int], bool]:
-    """How kernels are launched on a pair of pictures, after a check of these.
+def _launch(image: Tensor, target: Tensor, *more: Tensor) -> tuple[tuple[int, int], tuple[int, int], bool]:
+    """How kernels are launched on a pair of pictures, after a check of these and of what else a backward pass gets.
 
     Returns:
         Programs down and along them; their rows, and floats in a row; whether the target is uint8.
     """
-    check_pair(image, target)
     of_bytes = target.dtype == torch.uint8
-    check_tensor("image", image, image.shape, image.device)
-    check_tensor("target", target, image.shape, image.device, torch.uint8 if of_bytes else torch.float32)
+    pair = f"image [H, W, 3], target [H, W, 3] {'uint8' if of_bytes else 'float32'}"
+    check_fit(f"{pair}, derivatives [{DERIVATIVES}, H, W, 3], steps [3], scale []", image, target, *more)
     height, width, _ = image.shape
     grid = triton.cdiv(height, ROWS), triton.cdiv(3 * width, COLUMNS)
     return grid, (height, 3 * width), of_bytes
@@ -256,10 +255,7 @@ def fused_loss_backward(image: Tensor, target: Tensor, derivatives: Tensor, step
         ValueError: As in :func:`fused_loss`, or the derivatives belong to another picture.
         TypeError: A dtype is wrong.
     """
-    grid, size, of_bytes = _launch(image, target)
-    check_tensor("derivatives", derivatives, (DERIVATIVES, *image.shape), image.device)
-    check_tensor("steps", steps, (3,), image.device)
-    check_tensor("scale", scale, (), image.device)
+    grid, size, of_bytes = _launch(image, target, derivatives, steps, scale)
     blurred = torch.empty_like(derivatives)
     gradient = torch.empty_like(image)
     with torch.cuda.device_of(image):

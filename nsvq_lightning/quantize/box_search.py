@@ -18,7 +18,7 @@ import numpy as np
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
-from nsvq_lightning.compute.memory import INT32, INT64, Array, aligned_empty, check_array, check_inside, check_table
+from nsvq_lightning.compute.memory import Array, aligned_empty, check_fit, check_inside
 from nsvq_lightning.compute.rows import count_outside
 from nsvq_lightning.compute.simd import fma, get, integer, lane_min, load, lowest_bit, mask_bits, put, store
 
@@ -37,12 +37,7 @@ def sort_into_leaves(codebook: Array) -> Array:
     """Codes ``[K]`` int32 in an order in which each 16, a leaf, are near each other, and each 256, a node.
 
     What is larger is cut near the median of the axis along which it is widest. Those with a NaN lie far away.
-
-    Raises:
-        ValueError: The codebook is not contiguous ``[K, D]``.
-        TypeError: It is not float32.
     """
-    check_table("codebook", codebook)
     order = np.arange(len(codebook), dtype=np.int32)
     columns = np.nan_to_num(codebook.T, nan=3e38).astype(np.float64)
     parts = [order]
@@ -305,14 +300,14 @@ def box_search(
     memory: tuple[Array, ...] | None = None,
     travelled: float = 0.0,
 ) -> Array:
-    """Nearest codes ``[V]`` of contiguous queries; one with a NaN gets code 0.
+    """Nearest codes ``[V]`` of queries; one with a NaN gets code 0.
 
     Args:
-        x: Queries ``[N, D]``.
-        codebook: Codes ``[K, D]``, contiguous, K at least 1.
+        x: Queries ``[N, D]``, contiguous float32.
+        codebook: Codes ``[K, D]``, contiguous float32, K at least 1.
         order: From :func:`sort_into_leaves`. That of an earlier codebook saves the sorting, is correct in any case, and
             good while codes have moved little.
-        rows: Which queries, ``[V]``, distinct; all of them by default.
+        rows: Which queries, ``[V]`` int64, distinct and in [0, N); all of them by default.
         memory: What is known of these rows (it may have more) from their last searches, updated in place: their codes
             ``[N]`` int32, -1 before the first; where they were then ``[N, D]``; and the distances below which there was
             no other code, plus how far the codes had moved by then, ``[N]`` in float64, because movements add up over a
@@ -323,20 +318,14 @@ def box_search(
         ValueError: The arrays do not fit together, one is not contiguous, or a row or a code is out of range.
         TypeError: A dtype is wrong.
     """
-    check_table("x", x)
     count, dim = x.shape
-    num_codes = len(codebook)
-    check_array("codebook", codebook, (num_codes, dim), x.dtype)
     order = sort_into_leaves(codebook) if order is None else order
     rows = np.arange(count) if rows is None else rows
-    remembered = 0 if memory is None else max(count, len(memory[0]))
     last, anchors, clearance = memory or (np.empty(0, np.int32), np.empty((0, dim), np.float32), np.empty(0))
-    check_array("order", order, (num_codes,), INT32)
-    check_array("rows", rows, (rows.size,), INT64)
-    check_array("memory[0]", last, (remembered,), INT32)
-    check_array("memory[1]", anchors, (remembered, dim), x.dtype)
-    check_array("memory[2]", clearance, (remembered,), np.dtype(np.float64))
-    check_inside("order", order, num_codes)
+    text = "x [N, D], codebook [K, D], order [K] int32, rows [V] int64, codes [M] int32, anchors [M, D], "
+    remembered = max(count, len(last)) if memory else 0
+    check_fit(f"{text}clearance [M] float64", x, codebook, order, rows, last, anchors, clearance, M=remembered)
+    check_inside("order", order, len(codebook))
     result = np.empty(len(rows), np.int64)
     thread_count()
     blocks, tree = -(-len(rows) // _ROWS), _boxes(codebook, order)

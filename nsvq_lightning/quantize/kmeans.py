@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import parallel, thread_count
-from nsvq_lightning.compute.memory import INT64, flat_checked
+from nsvq_lightning.compute.memory import flat
 from nsvq_lightning.compute.rows import put_rows, share
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.splats.splats import distinct_rows
@@ -42,7 +42,7 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
 
     Raises:
         ValueError: The values are not ``[N, D]``, or there is not one code per row.
-        TypeError: The codes are not int64, or the values neither float32 nor float64.
+        TypeError: The values are neither float32 nor float64.
     """
     if values.dim() != 2 or codes.shape != values.shape[:1]:
         raise ValueError(f"values must be [N, D] and codes [N], got {list(values.shape)} and {list(codes.shape)}")
@@ -52,10 +52,9 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
     if kernels_for(values) == "cuda":
         from nsvq_lightning.quantize.cuda.substitution import sum_rows
 
-        return sum_rows(values.contiguous(), codes, num_codes, dtype)
+        return sum_rows(values, codes, num_codes, dtype)
     sums = torch.zeros(num_codes, values.shape[1], dtype=dtype)
-    numbers = flat_checked("codes", codes.cpu().contiguous(), (len(values),), INT64)
-    _sum_rows(thread_count(), values.cpu().contiguous().numpy(), numbers, sums.numpy())
+    _sum_rows(thread_count(), values.cpu().contiguous().numpy(), flat(codes.cpu()), sums.numpy())
     return sums.to(values.device)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
-from nsvq_lightning.compute.memory import FLOAT32, Array, aligned_empty, check_array, check_table
+from nsvq_lightning.compute.memory import Array, aligned_empty, check_fit
 from nsvq_lightning.compute.simd import fma, fnma, get, integer, load, put, store
 
 # Codes in the list of a row.
@@ -232,11 +232,11 @@ def _search_kernel(dim: int) -> Any:
 
 
 def score_search(x: Array, codebook: Array, with_lists: bool = False) -> tuple[Array, Array, Array]:
-    """Nearest codes of contiguous rows ``x [N, D]``; a row with a NaN gets code 0.
+    """Nearest codes of rows ``x [N, D]``; a row with a NaN gets code 0.
 
     Args:
-        x: Rows.
-        codebook: Codes ``[K, D]``, contiguous, K at least 1.
+        x: Rows, contiguous float32.
+        codebook: Codes ``[K, D]``, contiguous float32, K at least 1.
         with_lists: Whether to return what else the search finds.
 
     Returns:
@@ -248,9 +248,8 @@ def score_search(x: Array, codebook: Array, with_lists: bool = False) -> tuple[A
         ValueError: Rows and codes do not fit together, or an array is not contiguous.
         TypeError: One is not float32.
     """
-    check_table("x", x)
+    check_fit("x [N, D], codebook [K, D]", x, codebook)
     count, dim = x.shape
-    check_array("codebook", codebook, (len(codebook), dim), FLOAT32)
     result = np.empty(count, np.int64)
     listed = count if with_lists else 0
     lists = np.empty((listed, LIST), np.int32)

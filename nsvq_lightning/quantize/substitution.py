@@ -17,11 +17,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
-from nsvq_lightning.compute.memory import check_inside, check_tensor, flat, recycled
+from nsvq_lightning.compute.memory import check_fit, check_inside, flat, recycled
 from nsvq_lightning.compute.rows import clear, clear_between, count_outside, share
 from nsvq_lightning.compute.simd import broadcast, fma, get, lane_sum, load, log2, put, sqrt, store, where
 from nsvq_lightning.quantize.scores import new_lanes
@@ -271,19 +270,14 @@ def substitute(
     return out
 
 
-def check_inputs(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor, **chosen: Tensor) -> None:
-    """Refuse tensors that do not fit together; ``chosen`` have one row ``[V, D]`` for each of ``rows [V]``.
+def check_inputs(*tensors: Tensor) -> None:
+    """Refuse tensors that do not fit together; the last two are those of a backward pass.
 
     Raises:
         ValueError: The shapes or devices do not fit together, or one is not contiguous.
         TypeError: A dtype is wrong.
     """
-    check_tensor("x", x, (len(x), codebook.shape[-1]), x.device)
-    check_tensor("rows", rows, (rows.numel(),), x.device, torch.int64)
-    check_tensor("codebook", codebook, (len(codebook), x.shape[1]), x.device)
-    check_tensor("codes", codes, (len(rows),), x.device, torch.int64)
-    for name, table in chosen.items():
-        check_tensor(name, table, (len(rows), x.shape[1]), x.device)
+    check_fit("x [N, D], rows [V] int64, codebook [K, D], codes [V] int64, grad [V, D], out [V, D]", *tensors)
 
 
 def _check_inside(x: Tensor, rows: Tensor, codebook: Tensor, codes: Tensor) -> None:
@@ -303,7 +297,7 @@ def substitute_backward(
         ValueError: As for :func:`substitute`.
         TypeError: A dtype is wrong.
     """
-    check_inputs(x, rows, codebook, codes, grad=grad, out=out)
+    check_inputs(x, rows, codebook, codes, grad, out)
     grad_x, grad_codebook = recycled(x.shape), recycled(codebook.shape)
     # Enough parts for the threads, few enough that adding them up is cheap.
     parts = max(4, min(64, len(rows) // (4 * len(codebook))))

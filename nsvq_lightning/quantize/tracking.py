@@ -19,7 +19,7 @@ from torch import Tensor
 from nsvq_lightning.compute import simd
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import F, inline, parallel, thread_count
-from nsvq_lightning.compute.memory import INT64, Array, check_array
+from nsvq_lightning.compute.memory import Array, check_fit
 from nsvq_lightning.compute.simd import get, integer, load, put, store
 from nsvq_lightning.quantize.box_search import MAX_DIM, ROUNDING, box_search, sort_into_leaves
 from nsvq_lightning.quantize.nearest import check_rows, nearest
@@ -146,12 +146,11 @@ class NearestTracker:
             TypeError: The dtypes differ or are not floating point, or rows are not int64.
         """
         x, codebook = check_rows(x, codebook)
-        if rows is not None and rows.dim() != 1:
-            raise ValueError(f"rows must have shape [V], got {list(rows.shape)}")
+        chosen = torch.arange(len(x), device=x.device) if rows is None else rows.contiguous()
+        check_fit("rows [V] int64", chosen)
         kernels = kernels_for(x)
         if kernels is None:
             return nearest(x if rows is None else x.index_select(0, rows), codebook)
-        chosen = torch.arange(len(x), device=x.device) if rows is None else rows.contiguous()
         if kernels == "cuda":
             from nsvq_lightning.quantize.cuda.search import DeviceTracker
 
@@ -159,7 +158,6 @@ class NearestTracker:
                 self._on_device = DeviceTracker(codebook)
             return cast(Tensor, self._on_device.search(x, codebook, chosen))
         numbers = chosen.numpy()
-        check_array("rows", numbers, (len(numbers),), INT64)
         if len(numbers) and (numbers[0] < 0 or numbers[-1] >= len(x) or not (numbers[1:] > numbers[:-1]).all()):
             raise ValueError(f"rows must be ascending, distinct and in [0, {len(x)})")
         self._make_room(len(x), codebook.numpy())

@@ -86,7 +86,7 @@ def render(
     if degree not in range(stored + 1):
         raise ValueError(f"sh_degree must be between 0 and the stored degree {stored}, got {sh_degree}")
     means = splats.means
-    behind = means.new_zeros(3) if background is None else torch.as_tensor(background).to(means)
+    behind = means.new_zeros(3) if background is None else torch.as_tensor(background).to(means).contiguous()
     if behind.shape != (3,):
         raise ValueError(f"background must be one RGB colour of shape [3], got {list(behind.shape)}")
     absgrad = None

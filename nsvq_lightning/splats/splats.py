@@ -12,6 +12,9 @@ from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
 from nsvq_lightning.splats.conventions import MIN_SQUARED_NORM, SH_C0, sh_coefficients, shN_degree
 from nsvq_lightning.top_level import log
 
+# What attributes of N splats are, for :func:`nsvq_lightning.compute.memory.check_fit`.
+FORM = "means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh0 [N, 1, 3], shN [N, C, 3]"
+
 
 class RawSplats(NamedTuple):
     """The six raw attributes of N splats as plain tensors.

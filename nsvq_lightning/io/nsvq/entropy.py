@@ -10,9 +10,8 @@ import numpy as np
 from numba import int64, uint64
 
 from nsvq_lightning.compute.jit import inline, kernel
-from nsvq_lightning.compute.memory import INT32, INT64, UINT64, check_array, check_inside
+from nsvq_lightning.compute.memory import check_fit, check_inside
 from nsvq_lightning.io.errors import Bytes, FormatError
-from nsvq_lightning.io.morton import check_depths
 from nsvq_lightning.io.nsvq import range_coder as rc
 from nsvq_lightning.splats.conventions import Int32s, Int64s, Integers, Uint32s, Uint64s
 
@@ -55,20 +54,18 @@ def encode_paths(paths: Int64s, bits: int, neighbours: Int32s) -> bytes:
         neighbours: Two earlier rows ``[N, 2]`` that are likely to be similar, -1 where there is none.
 
     Raises:
-        ValueError: The arrays do not fit together, one is not contiguous, or a value is out of range.
+        ValueError: The arrays do not fit together, one is not contiguous, or a neighbour is out of range.
         TypeError: A dtype is wrong.
     """
-    check_array("paths", paths, (len(neighbours),), INT64)
+    check_fit("paths [N] int64", paths, N=len(neighbours))
     contexts = _path_contexts(bits, neighbours, True)
     words = _room(len(paths) * bits)
     return _bytes(words, _write_paths(paths, bits, neighbours, words, contexts))
 
 
 def _path_contexts(bits: int, neighbours: Int32s, two: bool) -> Uint32s:
-    """New contexts for the decisions of paths, one or two of each; refuses what no path may have."""
-    if not 0 <= bits <= 32:
-        raise ValueError(f"a path must have 0 to 32 bits, got {bits}")
-    check_array("neighbours", neighbours, (len(neighbours), 2), INT32)
+    """New contexts for the decisions of paths, one or two of each; refuses neighbours that no path may have."""
+    check_fit("neighbours [N, 2] int32", neighbours)
     check_inside("neighbours", neighbours, len(neighbours), -1)
     return rc.new_contexts((_RELATIONS + two) << min(bits, _MODELLED_BITS), rc.TWO_START * two)
 
@@ -104,8 +101,8 @@ def encode_keys(keys: Uint64s, depths: Int64s) -> bytes:
         ValueError: The arrays do not fit together, one is not contiguous, or keys do not ascend or are out of range.
         TypeError: A dtype is wrong.
     """
-    check_depths(depths, KEY_BITS)
-    check_array("keys", keys, (len(depths),), UINT64)
+    check_fit("keys [N] uint64, depths [N] int64", keys, depths)
+    check_inside("depths", depths, KEY_BITS + 1)
     if (keys[1:] < keys[:-1]).any() or (len(keys) and keys[-1] > _KEY_MASK):
         raise ValueError(f"keys must ascend and be below 2^{KEY_BITS}, got {keys}; sort them")
     words = _room(depths.sum() + 8 * len(keys))
@@ -120,7 +117,8 @@ def decode_keys(data: Bytes, depths: Int64s) -> Uint64s:
         ValueError: As for :func:`encode_keys`.
         TypeError: The depths are not int64.
     """
-    check_depths(depths, KEY_BITS)
+    check_fit("depths [N] int64", depths)
+    check_inside("depths", depths, KEY_BITS + 1)
     keys, words = np.empty(len(depths), np.uint64), _words(data)
     used = _read_keys(words, depths, keys, rc.new_contexts(_KEY_CONTEXTS))
     _check_used(words, used, "a position is outside its grid")
@@ -135,15 +133,16 @@ def encode_integers(values: Integers, order: Int64s | None = None) -> bytes:
     model of its column, its sign, the bit after the leading one by a model, and the other bits without a model.
 
     Raises:
-        ValueError: The values are not ``[N, D]``, not contiguous, or one is too large.
+        ValueError: The values are not ``[N, D]``, one is too large, or the order is not of their rows.
         TypeError: They are neither int64 nor int32.
     """
-    check_array("values", values, values.shape, INT32 if values.dtype == INT32 else INT64)
+    if values.dtype not in (np.int32, np.int64):
+        raise TypeError(f"values must be int64 or int32, got {values.dtype}")
     largest = max(-int(values.min(initial=0)), int(values.max(initial=0)))
     if values.ndim != 2 or largest >= _TOO_LARGE:
         raise ValueError(f"values must have shape [N, D] and be below 2^52 in size, got {list(values.shape)}")
     order = np.arange(len(values)) if order is None else order
-    check_array("order", order, (len(values),), INT64)
+    check_fit("order [N] int64", order, N=len(values))
     check_inside("order", order, len(values))
     bits = np.empty((_MODES, values.shape[1]), np.int64)  # about as many as each mode takes
     left = 0

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from nsvq_lightning.compute.jit import kernel
-from nsvq_lightning.compute.memory import check_table
 from nsvq_lightning.io.compressed import CompressedScene, slices
 from nsvq_lightning.io.morton import Grid
 from nsvq_lightning.io.nsvq.header import AttributeEntry
@@ -148,12 +147,7 @@ def tree_order(codebook: Float32s) -> Int64s:
 
     The rows are cut into two halves across the direction in which they differ most, each half again, and so on; for an
     odd number of rows, the first half gets one more.
-
-    Raises:
-        ValueError: It has another shape, or is not contiguous.
-        TypeError: It is not float32.
     """
-    check_table("codebook", codebook)
     order = np.arange(len(codebook))
     _cut(codebook.astype(np.float64), order)
     return order

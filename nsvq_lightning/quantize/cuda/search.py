@@ -20,7 +20,7 @@ from torch import Tensor
 from triton.language import constexpr
 
 from nsvq_lightning.compute.devices import COMPILE
-from nsvq_lightning.compute.memory import check_tensor
+from nsvq_lightning.compute.memory import check_fit
 from nsvq_lightning.quantize.box_search import ROUNDING
 from nsvq_lightning.quantize.scores import LIST
 
@@ -106,8 +106,7 @@ def nearest_codes(x: Tensor, codebook: Tensor) -> Tensor:
         ValueError: Rows and codes do not fit together, or one is not contiguous.
         TypeError: A dtype is wrong.
     """
-    check_tensor("x", x, (len(x), codebook.shape[-1]), x.device)
-    check_tensor("codebook", codebook, (len(codebook), x.shape[1]), x.device)
+    check_fit("x [N, D], codebook [K, D]", x, codebook)
     result = x.new_empty(len(x), dtype=torch.int64)
     if len(x):
         codes = by_column(codebook)
@@ -317,9 +316,7 @@ class DeviceTracker:
             TypeError: A dtype is wrong.
         """
         (num_codes, dim), device = self._snapshot.shape, self._snapshot.device
-        check_tensor("x", x, (len(x), dim), device)
-        check_tensor("codebook", codebook, (num_codes, dim), device)
-        check_tensor("rows", rows, (len(rows),), device, torch.int64)
+        check_fit("snapshot [K, D], x [N, D], codebook [K, D], rows [V] int64", self._snapshot, x, codebook, rows)
         count = len(rows)
         result = torch.empty_like(rows)
         more = len(x) - len(self._memory[0])

@@ -16,7 +16,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from triton.language import constexpr
 
 from nsvq_lightning.compute.devices import COMPILE
-from nsvq_lightning.compute.memory import check_tensor
+from nsvq_lightning.compute.memory import check_fit
 from nsvq_lightning.compute.rows import sorted_by_key
 from nsvq_lightning.quantize import substitution
 from nsvq_lightning.quantize.cuda.search import load_if, places
@@ -188,7 +188,7 @@ def substitute_backward(
         ValueError: As for :func:`substitute`.
         TypeError: A dtype is wrong.
     """
-    substitution.check_inputs(x, rows, codebook, codes, grad=grad, out=out)
+    substitution.check_inputs(x, rows, codebook, codes, grad, out)
     grad_x, radials = torch.zeros_like(x), torch.empty_like(out)
     _launch(radial_kernel, x, rows, codebook, grad, x, rows, codebook, codes, out, grad_x, radials)
     return grad_x, sum_rows(radials, codes, len(codebook), x.dtype)
@@ -250,18 +250,18 @@ def sum_rows(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtype) 
     """Sums ``[K, D]`` of the rows of each code, 0 for a code without rows; nothing is read back from the device.
 
     Args:
-        values: Contiguous rows ``[N, D]`` on a CUDA device.
+        values: Rows ``[N, D]`` on a CUDA device.
         codes: Codes ``[N]`` int64 in [0, K).
         num_codes: K.
         dtype: Dtype of the sums and of their accumulation.
 
     Raises:
-        ValueError: The values are not ``[N, D]`` or not contiguous, or there is not one code per row.
-        TypeError: A dtype is wrong.
+        ValueError: The values are not ``[N, D]``, or there is not one code per row there.
+        TypeError: They are not int64.
     """
-    check_tensor("values", values, (len(values), values.shape[-1]), values.device, values.dtype)
-    check_tensor("codes", codes, (len(values),), values.device, torch.int64)
+    check_fit("codes [N] int64", codes, N=len(values))
     order, offsets = _remembered(codes, num_codes)
+    values = values.contiguous()
     dim = values.shape[1]
     width = min(64, triton.next_power_of_2(dim))
     columns = triton.cdiv(dim, width)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.jit import F, parallel, parts_of
-from nsvq_lightning.compute.memory import INT32, Array, Workspace, flat, flat_checked, recycled
+from nsvq_lightning.compute.memory import Array, Workspace, check_fit, flat, recycled
 from nsvq_lightning.compute.rows import clear_all, share, vector_share
 from nsvq_lightning.compute.simd import get, put
 from nsvq_lightning.rendering.camera import Camera
@@ -20,8 +20,8 @@ from nsvq_lightning.rendering.cpu import records as rec
 from nsvq_lightning.rendering.formulas import TILE
 from nsvq_lightning.rendering.sampling import Layers, Shading, ViewSampling
 from nsvq_lightning.skips import is_on
-from nsvq_lightning.splats.attributes import ATTRIBUTES, attribute_shapes
-from nsvq_lightning.splats.splats import RawSplats, sh_degree_of
+from nsvq_lightning.splats.attributes import ATTRIBUTES
+from nsvq_lightning.splats.splats import FORM, RawSplats
 
 # Fewer splats than these are not worth a part of their own: to wake a thread takes a tenth of a millisecond.
 PROJECTED, LISTED, SORTED = 2048, 4096, 65_536
@@ -40,15 +40,14 @@ class _Frame:
         side = TILE << rec.GROUP_SHIFT
         self.group_columns, group_rows = -(-width // side), -(-height // side)
         self.tiles = self.group_columns * group_rows * rec.GROUP_TILES
-        self.n = n = splats.means.shape[0]
-        shapes = ((n, *shape) for shape in attribute_shapes(sh_degree_of(splats.shN)).values())
-        attributes = tuple(map(flat_checked, ATTRIBUTES, splats, shapes))
+        self.n = splats.means.shape[0]
+        attributes = tuple(map(flat, splats))
         self.geometry, self.colors = attributes[:4], attributes[4:]
         self.bands = 3 * splats.shN.shape[1], degree
-        self.parts = parts_of(n, PROJECTED)
+        self.parts = parts_of(self.n, PROJECTED)
         self.work = Workspace.borrow()
         weakref.finalize(self, self.work.give_back)
-        self.records = self.work.array("records", rec.RECORD * n)
+        self.records = self.work.array("records", rec.RECORD * self.n)
         self.integers = self.records.view(np.int32)
 
     def find(self) -> tuple[Array, Array, Array]:
@@ -152,10 +151,9 @@ class _Blend(torch.autograd.Function):
         shape = frame.size[::-1]
         planes = image, transmittance, depth = recycled((*shape, 3)), recycled(shape), recycled(shape)
         frame.bin()
-        behind = flat_checked("background", background.contiguous(), (3,))
         blending.blend(
-            frame.tiles, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.size, behind, _GRID,
-            frame.touched, frame.ends, tuple(map(flat, planes)), is_on("blocks"),
+            frame.tiles, frame.records, frame.entries, frame.offsets, frame.group_columns, frame.size,
+            flat(background), _GRID, frame.touched, frame.ends, tuple(map(flat, planes)), is_on("blocks"),
         )  # fmt: skip
         ctx.frame = frame
         ctx.set_materialize_grads(False)
@@ -170,7 +168,7 @@ class _Blend(torch.autograd.Function):
         # Placeholders that are never read stand in for missing gradients and a missing map.
         with_absgrad = pixel_weights is not None
         wanted = g_alpha is not None, g_depth is not None, with_absgrad
-        pixel_weights = flat_checked("pixel_weights", pixel_weights if with_absgrad else depth, frame.size[::-1])
+        pixel_weights = flat(pixel_weights if with_absgrad else depth)
         g_image = torch.zeros_like(image) if g_image is None else g_image
         g_alpha = transmittance if g_alpha is None else g_alpha
         g_depth = depth if g_depth is None else g_depth
@@ -200,10 +198,14 @@ def render(splats: RawSplats, camera: Camera, shading: Shading) -> Layers:
         ValueError: The attributes do not fit together, or the image is too large.
         TypeError: An attribute is not float32.
     """
-    sh_degree, sampling, *behind = shading
+    sh_degree, sampling, background, pixel_weights, absgrad = shading
+    distances = None if sampling is None else sampling.distances
+    width, height = camera.size
+    text = f"{FORM}, background [3], pixel_weights [H, W], distances [2, N]"
+    check_fit(text, *splats, background, pixel_weights, distances, H=height, W=width)
     frame = _Frame(splats, camera, sh_degree, sampling)
     means2d, token, radii = _Project.apply(frame, *splats)
-    image, alpha, depth = _Blend.apply(frame, means2d, token, *behind)
+    image, alpha, depth = _Blend.apply(frame, means2d, token, background, pixel_weights, absgrad)
     return image, alpha, radii, means2d, depth
 
 
@@ -214,6 +216,7 @@ def visible(splats: RawSplats, camera: Camera) -> Tensor:
         ValueError: The attributes do not fit together, or the image is too large.
         TypeError: An attribute is not float32.
     """
+    check_fit(FORM, *splats)
     frame = _Frame(splats, camera, 0, None)
     found, counts, _ = frame.find()
     starts = (vector_share.py_func(frame.n, part, frame.parts)[0] for part in range(frame.parts))
@@ -245,15 +248,14 @@ def add_view(tables: Sequence[Tensor], gradients: Tensor, radii: Tensor, factors
         factors: Factors of x and y.
 
     Raises:
-        ValueError: The tensors differ in length, or one that is read or written in place is not contiguous.
+        ValueError: The tensors differ in length, or one is not contiguous.
         TypeError: A dtype is wrong.
     """
-    rows, columns = tuple(radii.shape[:1]), len(tables)
-    given = flat_checked("gradients", gradients.contiguous(), (*rows, columns))
-    seen = flat_checked("radii", radii, rows, INT32)
+    text = "gradients [N, C], radii [N] int32, sums [N], views [N], weights [N]"
+    check_fit(text, gradients.contiguous(), radii, *tables, C=len(tables))
+    given, seen = flat(gradients), flat(radii)
     # One thread adds up, and so to the same bits for any number of them.
-    positive = np.fmax(given[2::3] if columns == 3 else given[:0], 0)
+    positive = np.fmax(given[2::3] if len(tables) == 3 else given[:0], 0)
     total = positive.sum(dtype=np.float64)
     by_weight = np.count_nonzero(positive) / total if total > 0 else 0.0
-    changed = tuple(flat_checked("a table", table, rows) for table in tables)
-    _add(parts_of(len(seen), SORTED), changed, given, seen, (*map(F, factors), F(by_weight)))
+    _add(parts_of(len(seen), SORTED), tuple(map(flat, tables)), given, seen, (*map(F, factors), F(by_weight)))

@@ -6,13 +6,12 @@ pair instead of 64.
 
 from typing import NamedTuple
 
-import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
 from nsvq_lightning.compute.devices import COMPILE
-from nsvq_lightning.compute.memory import check_tensor
+from nsvq_lightning.compute.memory import check_fit
 from nsvq_lightning.compute.rows import sorted_by_key
 from nsvq_lightning.rendering.cuda.harmonics import load_if, places
 
@@ -84,8 +83,7 @@ def tiles_of(boxes: Tensor, ends: Tensor, total: int, columns: int, rows: int) -
         ValueError: Boxes and ends do not fit together, or are not contiguous.
         TypeError: They are not int32.
     """
-    check_tensor("boxes", boxes, (len(boxes), 4), boxes.device, torch.int32)
-    check_tensor("ends", ends, (len(boxes),), boxes.device, torch.int32)
+    check_fit("boxes [V, 4] int32, ends [V] int32", boxes, ends)
     keys, owners = (boxes.new_empty(total) for _ in range(2))
     if total:
         block = 512  # pairs per program

@@ -17,7 +17,7 @@ from triton.language import constexpr
 
 from nsvq_lightning.compute.devices import COMPILE
 from nsvq_lightning.compute.formulas import for_triton
-from nsvq_lightning.compute.memory import check_tensor
+from nsvq_lightning.compute.memory import check_fit
 from nsvq_lightning.rendering import formulas as shared
 from nsvq_lightning.rendering.cuda import records as rec
 from nsvq_lightning.rendering.cuda.binning import Tiles
@@ -25,6 +25,11 @@ from nsvq_lightning.rendering.cuda.harmonics import load_if, load_row, places, s
 from nsvq_lightning.rendering.cuda.projection import Lens
 
 formulas = for_triton(shared)
+# What records of splats and their lists by T tiles are, see :func:`check_fit`.
+_LISTS = (
+    f"records [V, {rec.RECORD.value}], offsets [O] int32, order [T] int32, ranks [P] int32, slots [P] int32, "
+    "ends [V] int32"
+)
 
 # Splats whose slots a program adds up: most have a few, and a program for each would have little to do.
 SPLATS = 16
@@ -206,15 +211,6 @@ def tile_grid(width: int, height: int) -> tuple[int, int]:
     return triton.cdiv(width, rec.TILE.value), triton.cdiv(height, rec.TILE.value)
 
 
-def _check_lists(records: Tensor, tiles: Tiles, count: int) -> None:
-    """Check the records, and the lists of ``count`` tiles."""
-    visible, pairs, device = len(records), len(tiles.ranks), records.device
-    check_tensor("records", records, (visible, rec.RECORD.value), device)
-    lengths = {"offsets": count + 1, "order": count, "ranks": pairs, "slots": pairs, "ends": visible}
-    for name, length in lengths.items():
-        check_tensor(f"tiles.{name}", getattr(tiles, name), (length,), device, torch.int32)
-
-
 def blend(lens: Lens, records: Tensor, tiles: Tiles, background: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Image ``[H, W, 3]``, transmittance ``[H, W]``, depth ``[H, W]``, and how far each list was processed.
 
@@ -229,8 +225,8 @@ def blend(lens: Lens, records: Tensor, tiles: Tiles, background: Tensor) -> tupl
         TypeError: A dtype is wrong.
     """
     columns, rows = tile_grid(lens.width, lens.height)
-    _check_lists(records, tiles, columns * rows)
-    check_tensor("background", background, (3,), records.device)
+    count = columns * rows
+    check_fit(f"{_LISTS}, background [3]", records, *tiles, background, T=count, O=count + 1)
     image = records.new_empty(lens.height, lens.width, 3)
     transmittance, depth = (records.new_empty(lens.height, lens.width) for _ in range(2))
     ends = records.new_empty(columns * rows, dtype=torch.int32)
@@ -273,18 +269,12 @@ def blend_backward(
         TypeError: A dtype is wrong.
     """
     columns, rows = tile_grid(lens.width, lens.height)
-    _check_lists(records, tiles, columns * rows)
-    check_tensor("ids", ids, (len(records),), records.device, torch.int64)
-    check_tensor("ends", ends, (columns * rows,), records.device, torch.int32)
-    size = lens.height, lens.width
-    for name, value, gradient in zip(("image", "alpha", "depth"), outputs, gradients, strict=True):
-        shape = (*size, 3) if name == "image" else size
-        check_tensor(name, value, shape, records.device)
-        if gradient is not None:
-            check_tensor(f"gradient of {name}", gradient, shape, records.device)
+    planes = ", ".join(f"{of}image [H, W, 3], {of}alpha [H, W], {of}depth [H, W]" for of in ("", "gradient of "))
+    text = f"{_LISTS}, ids [V] int64, ends of tiles [T] int32, {planes}, pixel_weights [H, W]"
+    given = ids, ends, *outputs, *gradients, pixel_weights
+    count = columns * rows
+    check_fit(text, records, *tiles, *given, T=count, O=count + 1, H=lens.height, W=lens.width)
     with_absgrad = pixel_weights is not None
-    if pixel_weights is not None:
-        check_tensor("pixel_weights", pixel_weights, size, records.device)
     image, transmittance, depth = outputs
     g_image, g_alpha, g_depth = gradients
     totals, g_means2d = torch.zeros_like(records), records.new_zeros(n, 2)

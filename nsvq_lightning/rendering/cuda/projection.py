@@ -11,14 +11,13 @@ from triton.language import constexpr
 
 from nsvq_lightning.compute.devices import COMPILE, to_device
 from nsvq_lightning.compute.formulas import for_triton
-from nsvq_lightning.compute.memory import check_tensor
+from nsvq_lightning.compute.memory import check_fit
 from nsvq_lightning.rendering import formulas as shared
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.cuda import records as rec
 from nsvq_lightning.rendering.cuda.harmonics import color, color_backward, load_if, load_row, places, store_row
 from nsvq_lightning.rendering.sampling import ViewSampling
-from nsvq_lightning.splats.attributes import attribute_shapes
-from nsvq_lightning.splats.splats import sh_degree_of
+from nsvq_lightning.splats.splats import FORM
 
 formulas = for_triton(shared)
 # Places of the limits of slopes and of the near plane among the numbers of a camera.
@@ -204,13 +203,8 @@ class Projected(NamedTuple):
 
 
 def _check_attributes(lens: Lens, attributes: tuple[Tensor, ...], sampling: ViewSampling | None) -> None:
-    n, device = len(attributes[0]), attributes[0].device
-    check_tensor("lens.view", lens.view, (20,), device)
-    shapes = attribute_shapes(sh_degree_of(attributes[-1])).items()
-    for attribute, (name, shape) in zip(attributes, shapes, strict=True):
-        check_tensor(name, attribute, (n, *shape), device)
-    if sampling is not None:
-        check_tensor("sampling", sampling.distances, (2, n), device)
+    distances = None if sampling is None else sampling.distances
+    check_fit(f"{FORM}, camera [20], distances [2, N]", *attributes, lens.view, distances)
 
 
 def _launch_projection(
@@ -229,12 +223,7 @@ def _launch_projection(
 
 
 def project_radii(lens: Lens, attributes: tuple[Tensor, ...]) -> Tensor:
-    """Radii ``[N]`` int32 of all splats, 0 where not in view; the colours in ``attributes`` are not read.
-
-    Raises:
-        ValueError: The tensors do not fit together.
-        TypeError: A dtype is wrong.
-    """
+    """Radii ``[N]`` int32 of all splats, 0 where not in view; the colours in ``attributes`` are not read."""
     unused = attributes[0]
     return _launch_projection(lens, attributes, RADIUS_ONLY, None, unused, unused, unused)
 
@@ -248,10 +237,6 @@ def project(lens: Lens, attributes: tuple[Tensor, ...], degree: int, sampling: V
             :class:`~nsvq_lightning.splats.splats.RawSplats`.
         degree: Highest SH degree that is evaluated, at most the stored one.
         sampling: How the splats were trained, or None.
-
-    Raises:
-        ValueError: The tensors do not fit together.
-        TypeError: A dtype is wrong.
     """
     means = attributes[0]
     n = len(means)
@@ -285,22 +270,15 @@ def project_backward(
         totals: Their summed moments ``[V, RECORD]``.
         g_means2d: Gradient of the projected centres ``[N, 2]``.
         sampling: As in :func:`project`.
-
-    Raises:
-        ValueError: The tensors do not fit together.
-        TypeError: A dtype is wrong.
     """
     _check_attributes(lens, attributes, sampling)
-    device = attributes[0].device
-    check_tensor("ids", ids, (len(ids),), device, torch.int64)
-    check_tensor("records", records, (len(ids), rec.RECORD.value), device)
-    check_tensor("totals", totals, (len(ids), rec.RECORD.value), device)
-    check_tensor("g_means2d", g_means2d, (len(attributes[0]), 2), device)
+    text = f"ids [V] int64, records [V, {rec.RECORD.value}], totals [V, {rec.RECORD.value}], g_means2d [N, 2]"
+    check_fit(text, ids, records, totals, g_means2d, N=len(attributes[0]))
     gradients = [torch.empty_like(attribute) for attribute in attributes]
     means, quats, scales, logits, _, shN = attributes
     n = len(means)
     ranks = means.new_full((n,), -1, dtype=torch.int32)
-    ranks[ids] = torch.arange(len(ids), dtype=torch.int32, device=device)
+    ranks[ids] = torch.arange(len(ids), dtype=torch.int32, device=ids.device)
     if n:
         project_backward_kernel[(triton.cdiv(n, BLOCK),)](
             means, quats, scales, logits, shN, *lens, n, *(sampling or NO_SAMPLING), ranks, records, totals, g_means2d,

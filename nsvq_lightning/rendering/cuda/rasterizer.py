@@ -45,7 +45,7 @@ class _Blend(torch.autograd.Function):
     def forward(ctx: Any, lens: Lens, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
         means2d, ids, records, boxes, background, pixel_weights, _absgrad = inputs
         tiles = list_tiles(boxes, *tile_grid(lens.width, lens.height))
-        image, transmittance, depth, ends = blend(lens, records, tiles, background.contiguous())
+        image, transmittance, depth, ends = blend(lens, records, tiles, background)
         ctx.lens, ctx.n = lens, len(means2d)
         ctx.save_for_backward(ids, records, ends, image, transmittance, depth, pixel_weights, *tiles)
         ctx.set_materialize_grads(False)
