@@ -302,8 +302,6 @@ class _Archive:
         palette = self.values("shN", centroids[: rows * coefficients, :3]).reshape(rows, 3 * coefficients)
         texels = self.texels("shN", 1)
         labels = texels[:, 0] + (texels[:, 1].astype(np.uint16) << 8)
-        if self.count and labels.max() >= rows:
-            raise FormatError(f"damaged: label {labels.max()} of a palette of {rows} rows")
         return palette, labels
 
 
@@ -389,7 +387,7 @@ def read_sog(path: StrPath) -> CompressedScene:
     Raises:
         FormatError: The file is truncated, altered, of another version, or not a ``.sog`` file.
     """
-    with naming_file(path):
+    with naming_file(path), as_defect("damaged", ValueError):
         data, size = _archived(Path(path))
         archive = _Archive(data)
         raw = {"quats": archive.quats(), "scales": archive.values("scales", archive.texels("scales")[:, :3])}

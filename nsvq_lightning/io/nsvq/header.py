@@ -257,9 +257,7 @@ def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
     Raises:
         FormatError: Not a ``.nsvq`` file, truncated, altered, or of another version.
     """
-    check_start(".nsvq", data, MAGIC)
-    if len(data) < _PREFIX.size:
-        raise FormatError(f"truncated: {len(data)} bytes, the prefix alone has {_PREFIX.size}")
+    check_start(".nsvq", data, MAGIC, _PREFIX.size)
     _, digest, version, json_bytes = _PREFIX.unpack_from(data)
     if blake2b(memoryview(data)[_DIGEST_END:], digest_size=len(digest)).digest() != digest:
         raise FormatError("truncated or altered: the checksum does not fit the content")
