@@ -269,8 +269,10 @@ def blend_backward(
         TypeError: A dtype is wrong.
     """
     columns, rows = tile_grid(lens.width, lens.height)
-    planes = ", ".join(f"{of}image [H, W, 3], {of}alpha [H, W], {of}depth [H, W]" for of in ("", "gradient of "))
-    text = f"{_LISTS}, ids [V] int64, ends of tiles [T] int32, {planes}, pixel_weights [H, W]"
+    text = (
+        f"{_LISTS}, ids [V] int64, ends of tiles [T] int32, image [H, W, 3], alpha [H, W], depth [H, W], "
+        "gradient of image [H, W, 3], gradient of alpha [H, W], gradient of depth [H, W], pixel_weights [H, W]"
+    )
     given = ids, ends, *outputs, *gradients, pixel_weights
     count = columns * rows
     check_fit(text, records, *tiles, *given, T=count, O=count + 1, H=lens.height, W=lens.width)
