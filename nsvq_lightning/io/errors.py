@@ -41,9 +41,13 @@ def naming_file(path: StrPath) -> Iterator[None]:
         raise FormatError(f"{path}: {error.defect}", error.remedy) from None
 
 
+# How a file begins that Git LFS has not fetched.
+LFS = b"version https://git-lfs"
+
+
 def wrong_start(suffix: str, data: bytes, magic: bytes) -> FormatError:
     """The error of a file that does not start as its format does, or ends before it does."""
-    if data.startswith(b"version https://git-lfs"):
+    if data.startswith(LFS):
         return FormatError(f"a pointer of Git LFS, not the {suffix} file itself", "get it by 'git lfs pull'")
     cut = "truncated, or " if magic.startswith(data[: len(magic)]) else ""
     return FormatError(f"{cut}not a {suffix} file: it does not start with {magic.decode('latin-1')!r}")

@@ -111,6 +111,12 @@ def test_points_of_images_may_have_identifiers_with_decimals(tmp_path: Path) -> 
     assert [image.name for image in read_images(path)] == ["1.jpg", "2.jpg"]
 
 
+def test_pointers_of_git_lfs_are_told(tmp_path: Path) -> None:
+    (tmp_path / "images.bin").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    with pytest.raises(ValueError, match=r"a pointer of Git LFS, .*'git lfs pull'"):
+        read_images(tmp_path / "images.bin")
+
+
 def test_sizes_are_rounded(tmp_path: Path) -> None:
     path = tmp_path / "cameras.txt"
     path.write_text("1 PINHOLE 79.99999 60.00001 80 80 40 30\n")

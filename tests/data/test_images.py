@@ -160,6 +160,14 @@ def test_damaged_pictures_are_named(tmp_path: Path, suffix: str, kept: float) ->
         read_image(path)
 
 
+def test_pointers_of_git_lfs_are_told(tmp_path: Path) -> None:
+    (tmp_path / "1.jpg").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    with pytest.raises(SceneError, match=r"1\.jpg cannot be decoded \(a pointer of Git LFS, .*'git lfs pull'"):
+        read_image(tmp_path / "1.jpg")
+    with pytest.raises(SceneError, match=r"2\.jpg cannot be read any more"):
+        read_image(tmp_path / "2.jpg")
+
+
 def test_the_end_of_a_thumbnail_is_not_that_of_the_picture(tmp_path: Path) -> None:
     path = tmp_path / "broken.jpg"
     PIL.Image.fromarray(cv2.resize(RGB, (200, 150))).save(
