@@ -45,6 +45,10 @@ class OpacityRegularization(SplatCallback):
             weight = module.schedule.strength(self.weight)
             module.loss_terms["opacity"] = lambda *_: weight * module.splats.opacities.sigmoid().sum()
 
+    def on_train_end(self, trainer: Trainer, module: SplatModule) -> None:
+        """Leave a loss without the term."""
+        module.loss_terms.pop("opacity", None)
+
 
 # Train views in which the effect of splats is measured, or a fourth of them where that is more.
 VIEWS = 64

@@ -108,6 +108,9 @@ def test_lambda_acts_in_the_prune_phase_only() -> None:
         values[step + 1] = [float(term(None, None)) for term in module.loss_terms.values()]
     expected = pytest.approx([1e-7 * float(opacities.sigmoid().sum())])
     assert values == {1: [], 15_000: [], 15_001: expected, 20_000: expected, 20_001: []}
+    module.loss_terms["opacity"] = None  # of a run that ends in the phase
+    callback.on_train_end(SimpleNamespace(), module)  # type: ignore[arg-type]
+    assert not module.loss_terms
 
 
 def test_photos_that_weights_need_are_missed_at_the_start() -> None:
