@@ -16,7 +16,7 @@ PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 # What names of folders of masks have in them.
 _OF_MASKS = re.compile("(?<!un)mask|^(alpha|matte)s?$", re.IGNORECASE)
 # The same of folders whose pictures are no photos, unless a model names them.
-_NO_PHOTOS = re.compile(f"{_OF_MASKS.pattern}|depth|normal", re.IGNORECASE)
+_NO_PHOTOS = re.compile("(?<!un)mask|depth|normal", re.IGNORECASE)
 
 
 def locate(

@@ -99,7 +99,7 @@ def test_photos_that_are_named_in_a_folder_of_small_ones_are_small_already(tmp_p
     assert photo_folder(tmp_path, "images_4", 2, ["1.jpg"]) == (tmp_path / "images_4", 2)
 
 
-@pytest.mark.parametrize("place", [".", "input", "colmap/pictures", "sparse/0"])
+@pytest.mark.parametrize("place", [".", "input", "colmap/pictures", "sparse/0", "Alpha"])
 def test_the_only_folder_that_has_the_photos_is_used(tmp_path: Path, place: str) -> None:
     names = ["cam/1.jpg", "cam/2.jpg"]
     write(tmp_path / place, *names)
