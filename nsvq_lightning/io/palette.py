@@ -137,7 +137,7 @@ def in_order_of_use(rows: Float32s, labels: Integers) -> tuple[Float32s, Int64s]
     return distinct[order], order.argsort()[labels]
 
 
-def scalar_kmeans(values: Float32s, weight: Integers | int = 1, count: int = 256) -> Float32s:
+def scalar_kmeans(values: Float32s, weight: Arrays | int = 1, count: int = 256) -> Float32s:
     """Levels ``[count]``, ascending, that nearly minimize the mean squared distance of values to their nearest level.
 
     If there are no more distinct values than levels, the levels are those values. Otherwise they start as the means of

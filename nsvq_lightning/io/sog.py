@@ -24,6 +24,7 @@ import math
 import re
 import struct
 import zlib
+from codecs import BOM_UTF8
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
@@ -73,7 +74,8 @@ def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
     logs = _signed_logs(scene.means)
     low, high = logs.min(0), logs.max(0)
     halves = _low_and_high(np.rint(65535 * ((logs - low) / np.where(high > low, high - low, 1))))
-    scales, scale_levels = _leveled(scene.rows("scales"))
+    # Unweighted, levels would be those of dust: large splats, as of walls and skies, would fall between them.
+    scales, scale_levels = _leveled(scene.rows("scales"), _visibility(scene)[:, None])
     colors, color_levels = _leveled(scene.rows("sh0"))
     texels = {
         "means_l.webp": halves[..., 0],
@@ -165,7 +167,7 @@ class _Archive:
         check_start(".sog", data, _ZIP)
         with as_defect("truncated: no valid zip archive", _BAD_ZIP):
             self._zip = ZipFile(BytesIO(data))
-        self.meta = json_object(self._bytes(META, 1 << 20), META)
+        self.meta = json_object(self._bytes(META, 1 << 20).removeprefix(BOM_UTF8), META)
         self.version = self.meta.get("version", 1)
         if self.version not in (1, 2):
             raise FormatError(f"version {str(self.version)[:40]} of the format; this release reads 1 and 2")
@@ -302,6 +304,8 @@ class _Archive:
         palette = self.values("shN", centroids[: rows * coefficients, :3]).reshape(rows, 3 * coefficients)
         texels = self.texels("shN", 1)
         labels = texels[:, 0] + (texels[:, 1].astype(np.uint16) << 8)
+        if self.count and labels.max() >= rows:
+            raise FormatError(f"damaged: label {labels.max()} of a palette of {rows} rows")
         return palette, labels
 
 
@@ -339,7 +343,7 @@ def _packed_quats(rows: Float32s) -> Uint8s:
     return np.column_stack([packed, 252 + largest]).astype(np.uint8)
 
 
-def _leveled(values: Float32s, weight: Integers | int = 1) -> tuple[Uint8s, list[float]]:
+def _leveled(values: Float32s, weight: Arrays | int = 1) -> tuple[Uint8s, list[float]]:
     """Index of the level of each value, and the levels: the shortest decimals that give the same float32."""
     from nsvq_lightning.io.palette import nearest_level, scalar_kmeans
 
@@ -387,7 +391,7 @@ def read_sog(path: StrPath) -> CompressedScene:
     Raises:
         FormatError: The file is truncated, altered, of another version, or not a ``.sog`` file.
     """
-    with naming_file(path), as_defect("damaged", ValueError):
+    with naming_file(path):
         data, size = _archived(Path(path))
         archive = _Archive(data)
         raw = {"quats": archive.quats(), "scales": archive.values("scales", archive.texels("scales")[:, :3])}

@@ -134,7 +134,7 @@ def test_a_folder_of_pictures(tmp_path: Path, kind: str, below: str) -> None:
         text = text.replace(name, below + name.replace(".webp", suffix))
     files = {below + name: data for name, data in files.items()}
     (tmp_path / below).mkdir(exist_ok=True)
-    (tmp_path / "meta.json").write_text(text)
+    (tmp_path / "meta.json").write_bytes(b"\xef\xbb\xbf" + text.encode())  # as editors of Windows write it
     Image.new("RGB", (9, 9)).save(tmp_path / f"photo{suffix}")  # of no concern
     for name, data in files.items():
         size = Image.open(io.BytesIO(data)).width
@@ -143,7 +143,19 @@ def test_a_folder_of_pictures(tmp_path: Path, kind: str, below: str) -> None:
     for name, values in vars(arrays_of(whole)).items():
         np.testing.assert_array_equal(getattr(arrays_of(back), name), values)
     pictures = sum((tmp_path / name).with_suffix(suffix).stat().st_size for name in files)
-    assert back.stored_bytes == len(text) + pictures
+    assert back.stored_bytes == 3 + len(text) + pictures
+
+
+def test_large_splats_keep_their_lengths_among_dust(tmp_path: Path) -> None:
+    scene, rng = plain_scene(4000, 0), np.random.default_rng(1)
+    scales = scene.values("scales")
+    scales[:] = rng.uniform(-12, -6, scales.shape)
+    scales[:20] = rng.uniform(-1, 2, (20, 3))
+    scene.opacities[:] = 3
+    save(scene, tmp_path / "x.sog")
+    back = read_scene(tmp_path / "x.sog")
+    large = np.sort(back.values("scales")[back.values("scales").min(1) > -2], axis=0)
+    np.testing.assert_allclose(large, np.sort(scales[:20], axis=0), atol=0.02)
 
 
 def test_null_in_a_codebook_is_in_line_with_the_other_levels(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
