@@ -19,16 +19,20 @@ from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT
-from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, distinct_rows
+from nsvq_lightning.splats.splats import RawSplats, Splats, SplatTensors, detached, distinct_rows
 from nsvq_lightning.top_level import log
 from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.importance import contributions, sensitivity
 from nsvq_lightning.training.splat_scene import SplatScene
 
-# First splats of a run with a budget (docs/recipe.md): opacity; largest size in pixels of the nearest photo, as a lone
-# point would hide what is behind it; most points of those that there are, as a multiple of those to start with; share
-# of the photos in which points must lie, as a scanner that reaches a few metres has many points there, and none behind.
+# First splats of a run with a budget (docs/recipe.md): opacity; largest size in pixels of the usual photo, from the
+# nearest camera, as a lone point would hide what is behind it; most points of those that there are, as a multiple of
+# those to start with; share of the photos in which points must lie, as a scanner that reaches a few metres has many
+# points there, and none behind.
 FIRST_OPACITY, MAX_PIXELS, MOST_POINTS, MIN_COVERED = 0.3, 50.0, 8, 0.75
+# A point is lone whose neighbours are farther than this share of its distance from the nearest camera, and in the way
+# if that distance is below this share of the median: of SfM's points of six scenes, at most 0.16 % are.
+LONE, NEAR_BY = 0.1, 0.3
 
 
 def scene_of(trainer: Trainer | None) -> Scene | None:
@@ -205,7 +209,11 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
     points, colors = (torch.cat(parts) for parts in zip((points, colors), far_points(scene, points), strict=True))
     splats = Splats.from_points(points, colors, sh_degree, FIRST_OPACITY)
     cameras = scene.train_cameras
-    pixel = camera_distances(cameras, splats.means.detach()) / max(camera.intrinsics[0] for camera in cameras)
+    apart = camera_distances(cameras, splats.means.detach())
+    if len(splats) > 2 * FEW_POINTS:  # of a few, each is lone
+        kept = (splats.scales[:, 0].exp() < LONE * apart) | (apart > NEAR_BY * apart.median())
+        splats, apart = Splats.from_tensors(*(values[kept] for values in detached(splats))), apart[kept]
+    pixel = apart / float(np.median([camera.intrinsics[0] for camera in cameras]))
     splats.scales.data.clamp_(max=(MAX_PIXELS * pixel).log()[:, None])
     return splats
 
@@ -228,7 +236,7 @@ def _with_dense_points(scene: Scene, count: int, seed: int, least: int = 0) -> t
     log.info(f"dense start: {len(dense)} points beside {known} of SfM, {time.perf_counter() - start:.1f} s")
     if 2 * len(dense) < (room if fills else 1):
         log.warning(
-            "photos show little that could be followed: training starts from SfM's points, or random ones; are the "
+            "photos show little to follow, or hardly move: training starts from SfM's points, or random ones; are the "
             "cameras right (focal lengths in pixels; in a transforms file camera to world, y up, z backward)?"
         )
     order, most = slice(None, None, -1 if fills else 1), known + room

@@ -22,6 +22,8 @@ from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.points import projected
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.formats import save
+from nsvq_lightning.random import generator
+from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.frame import EXTENT, Frame
 from nsvq_lightning.rendering.rasterize import render
@@ -193,6 +195,42 @@ def test_a_lone_point_before_the_cameras_does_not_hide_the_scene(make_scene: Cal
     assert float(pixels[0]) == pytest.approx(50.0, rel=1e-4)
     assert torch.equal(capped.scales[1:], free.scales[1:])
     assert capped.opacities.sigmoid().tolist() == pytest.approx([0.3] * 4)
+
+
+def test_lone_points_near_the_cameras_are_left_out(demo_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those in the way, as of wrong matches; those far away, or near others, stay."""
+    monkeypatch.setattr(run_scene, "dense_points", lambda *_: (torch.empty(0, 3), torch.empty(0, 3)))
+    data = ColmapDataModule(str(demo_scene), factor=4)
+    trainer: Any = SimpleNamespace(datamodule=data)
+    scene = data.scene
+    points = scene.points.repeat(4, 1)
+    points += 0.01 * torch.randn(points.shape, generator=generator(0))
+    colors = scene.colors.repeat(4, 1)
+    data.scene = replace(scene, points=points, colors=colors)
+    before = first_splats(trainer, 0, 9000, 0)
+    lone = torch.stack([camera.position + 0.3 * camera.viewmat[2, :3] for camera in scene.train_cameras[:3]]).float()
+    near = lone[0] + 0.001 * torch.rand(5, 3, generator=generator(1))  # together they are none
+    data.scene = replace(
+        scene, points=torch.cat([points, lone[1:], near]), colors=torch.cat([colors, torch.ones(7, 3)])
+    )
+    after = first_splats(trainer, 0, 9000, 0)
+    assert len(after) == len(before) + 5
+
+
+def test_one_large_photo_does_not_make_the_first_splats_of_others_small(
+    demo_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_scene, "dense_points", lambda *_: (torch.empty(0, 3), torch.empty(0, 3)))
+    monkeypatch.setattr(run_scene, "far_points", lambda *_: (torch.empty(0, 3), torch.empty(0, 3)))
+    data = ColmapDataModule(str(demo_scene), factor=4)
+    trainer: Any = SimpleNamespace(datamodule=data)
+    usual = first_splats(trainer, 0, 10_000, 0).scales
+    cameras = list(data.scene.cameras)
+    one = cameras[data.scene.train[0]]
+    sharp = one.K * torch.tensor([[8.0], [8.0], [1.0]])
+    cameras[data.scene.train[0]] = Camera(sharp, one.viewmat, 8 * one.width, 8 * one.height, one.near)
+    data.scene = replace(data.scene, cameras=tuple(cameras))
+    assert torch.equal(first_splats(trainer, 0, 10_000, 0).scales, usual)
 
 
 def test_positions_move_in_proportion_to_their_distance(demo_scene: Path) -> None:
