@@ -194,6 +194,15 @@ def check_config(path: str) -> dict[str, Any]:
     """
     import yaml
 
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]
+        """Refuses names that stand twice, of which YAML's own takes the last one without a word."""
+
+        def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
+            names = [key.value for key, _ in node.value]
+            if twice := [name for name in names if names.count(name) > 1]:
+                raise ValueError(f"line {node.start_mark.line + 1} begins a part that has {twice[0]} twice")
+            return super().construct_mapping(node, deep)
+
     file = Path(path)
     if not file.is_file():
         return {}
@@ -202,7 +211,7 @@ def check_config(path: str) -> dict[str, Any]:
         raise ValueError(f"config {path} has {size} bytes, more than {MAX_BYTES}: give another file")
     try:
         # Not the parser's loader: what is nested too deep would overflow its stack.
-        settings = yaml.SafeLoader(file.read_text(encoding="utf-8")).get_single_data()
+        settings = Loader(file.read_text(encoding="utf-8")).get_single_data()
         json.dumps(settings, default=str)  # refuses what holds itself
     except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"config {path} is not YAML ({' '.join(str(error).split())}): correct the file") from error

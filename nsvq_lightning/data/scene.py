@@ -296,8 +296,9 @@ def load_scene(
         raise ValueError(f"factor must be None, 1, 2, 4 or 8, got {factor}")
     if max_width is not None and max_width < 1:
         raise ValueError(f"max_width must be None or at least 1 pixel, got {max_width}")
-    if test_every < 2:
+    if not test_every or test_every < 2:
         raise ValueError(f"test_every must be at least 2 (1 leaves no train view), got {test_every}")
+    images_folder = images_folder or "images"  # null in a config
     root = Path(root).expanduser()
     poses = read_poses(root, model, allow_outside=allow_outside)
     if model is None and poses.source == "COLMAP" and (larger := larger_models(root)):

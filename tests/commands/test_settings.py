@@ -97,6 +97,8 @@ def test_values_are_found_by_the_name_that_an_option_has_without_its_class() -> 
         (b"#" * 200_000, "has 200000 bytes"),
         (b"[" * 100_000, "is not YAML .*recursion"),
         (b"a: &a {b: *a}", "is not YAML .*Circular"),
+        (b"trainer: {a: 1}\nmodel: {}\ntrainer: {b: 1}\n", "is not YAML .*line 1 begins a part that has trainer twice"),
+        (b"model:\n  a: {b: 1, c: 2, b: 1}", "is not YAML .*line 2 begins a part that has b twice"),
         (b"callbacks:\n#  selection: null\n", "has nothing below callbacks: remove that line"),
     ],
 )

@@ -111,6 +111,13 @@ def test_numbers_that_no_lens_has_are_told(
     assert ("camera 1 is odd: focal lengths " in caplog.text) == is_odd
 
 
+def test_null_in_a_config(make_scene: SceneFactory) -> None:
+    root: Any = make_scene()
+    with pytest.raises(ValueError, match="test_every must be at least 2"):
+        load_scene(root, test_every=None)  # type: ignore[arg-type]
+    assert len(load_scene(root, images_folder=None)) == len(load_scene(root))  # type: ignore[arg-type]
+
+
 def test_a_focal_length_of_zero_is_refused(make_scene: SceneFactory) -> None:
     root = make_scene(model="PINHOLE", params=(30.0, 0.0, 21.0, 15.0))
     with pytest.raises(SceneError, match=r"camera 1 of image .*: Camera\.K needs positive, finite focal lengths"):
