@@ -80,7 +80,9 @@ def run(options: Namespace) -> None:
         try:
             server = _Server((options.host, options.port), handler)
         except (OSError, OverflowError) as error:
-            raise OSError(f"cannot listen on {options.host}:{options.port} ({error}); choose another --port") from None
+            raise OSError(
+                f"cannot listen on {options.host}:{options.port} ({error}); choose another --port or --host"
+            ) from None
         with server:
             address = f"http://{options.host}:{server.server_port}/"
             say(f"{title} is at {address.replace('0.0.0.0', _own_address())} until Ctrl-C")

@@ -286,6 +286,8 @@ def _frames(file: Path, allow_outside: bool) -> tuple[Json, dict[str, _Frame]]:
     if not isinstance(head, dict) or not isinstance(head.get("frames"), list):
         raise SceneError(f"{file} has no list of frames: export it again")
     shared = {key: value for key, value in head.items() if key not in ("frames", "file_path", "mask_path")}
+    if shared.get("fisheye_crop_radius"):
+        log.warning(f"{file}: fisheye_crop_radius is not applied: leave out what lies beyond by masks")
     given = []
     for position, own in enumerate(head["frames"]):
         if not isinstance(own, dict):

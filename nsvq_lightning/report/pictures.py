@@ -46,7 +46,7 @@ def file_stem(name: str, names: tuple[str, ...] = ()) -> str:
 @lru_cache(maxsize=8)
 def _file_stems(names: tuple[str, ...]) -> dict[str, str]:
     """A file name without suffix for each name; those that are too long or used twice end in a digest."""
-    plain = {name: re.sub(r"[/\\]", "_", str(Path(name).with_suffix(""))) for name in names}
+    plain = {name: re.sub(r"[/\\:]", "_", str(Path(name).with_suffix(""))) for name in names}
     # What file systems that do not tell case or composed characters apart make of them.
     folded = {name: normalize("NFKC", normalize("NFKC", stem).casefold()) for name, stem in plain.items()}
     uses = Counter(folded.values())

@@ -161,6 +161,11 @@ def test_masks_beside_photos_elsewhere_are_not_looked_for(make_scene: SceneFacto
         assert Path(scene.images.sources[0].path).samefile(root / "images" / "000.png")
 
 
+def test_a_crop_of_fisheyes_is_told(make_scene: SceneFactory, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    load_scene(write_pinhole(make_scene(), tmp_path / "json", fisheye_crop_radius=9))
+    assert "fisheye_crop_radius is not applied: leave out what lies beyond by masks" in caplog.text
+
+
 def test_blender_scenes_have_their_own_split_and_random_points(
     demo_scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

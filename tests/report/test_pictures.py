@@ -137,6 +137,7 @@ def test_files_of_different_views_differ_and_fit_any_file_system(tmp_path: Path)
     ordinary = ("view_000.png", "IMG 1.2.JPG", "left/é.jpg", "right/é.jpg")
     assert [file_stem(name, ordinary) for name in ordinary] == ["view_000", "IMG 1.2", "left_é", "right_é"]
     assert file_stem("a/b.png") == "a_b"  # of views that nobody has listed
+    assert file_stem("C:\\me\\1.png") == "C__me_1"
     same = ("a/b.png", "a_b.png", "x.png", "x.jpg", "X.jpeg", "é.png", "e\u0301.png", "a/b.jpg~0123456789ab.png")
     deep = tuple("/".join(["ö" * 100] * 2 + [last]) for last in ("1.png", "2.png"))
     names = (*same, *deep, "y~0123456789ab.png", "z\udcff.png")
