@@ -239,8 +239,8 @@ def read_mask(path: Path, size: Size) -> Bools:
     bright = levels > black * levels.max()
     if is_cut(bright.shape[::-1], size):
         raise SceneError(
-            f"mask {path} is of {bright.shape[1]}x{bright.shape[0]}, its photo of {size[0]}x{size[1]}, another shape: "
-            "make it from that photo, or remove it"
+            f"mask {path} is of {bright.shape[1]}x{bright.shape[0]}, its photo of {size[0]}x{size[1]}, another shape, "
+            "or a few percent off as before undistortion: make it from that photo, scale it to its size, or remove it"
         )
     return np.asarray(cv2.resize(bright.view(np.uint8), size, interpolation=cv2.INTER_NEAREST), bool)
 

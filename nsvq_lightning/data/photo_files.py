@@ -14,9 +14,9 @@ from nsvq_lightning.top_level import log
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 # What names of folders of masks have in them.
-_OF_MASKS = re.compile("(?<!un)mask|^(alpha|matte)s?$", re.IGNORECASE)
+_OF_MASKS = re.compile("(?<!un)mask", re.IGNORECASE)
 # The same of folders whose pictures are no photos, unless a model names them.
-_NO_PHOTOS = re.compile("(?<!un)mask|depth|normal", re.IGNORECASE)
+_NO_PHOTOS = re.compile(f"{_OF_MASKS.pattern}|depth|normal", re.IGNORECASE)
 
 
 def locate(
@@ -189,7 +189,9 @@ def find_masks(
     usual = [root / name for name in folders if (root / name).is_dir()][:1]
     places = usual
     if not usual and not has_own and folders[-1] == "masks":
-        below = sorted({*root.rglob("*"), *photos.glob("*")})
+        photos, top = photos.absolute(), root.absolute()
+        around = {top, photos, *(place for place in photos.parents if place.is_relative_to(top))}
+        below = sorted({path for place in around for path in place.glob("*")})
         places = [path for path in below if _OF_MASKS.search(path.name) and path.is_dir()]
         places.append(photos)
     found = {place: masks for place in places if any(masks := masks_in(place, named, files, place == photos))}

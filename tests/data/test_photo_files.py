@@ -121,8 +121,6 @@ def test_the_only_folder_that_has_the_photos_is_used(tmp_path: Path, place: str)
         "mask/{}.JPG_mask.png",
         "images_masks/mask_{}.PNG",
         "images/masks/{}.png",
-        "dense/0/masks/{}.jpg.png",
-        "alpha/{}.png",
     ],
 )
 def test_masks_are_found_in_the_only_place_that_has_some(
@@ -150,6 +148,13 @@ def test_a_mask_of_what_a_photo_was_converted_from_is_its_own(tmp_path: Path) ->
         tmp_path / "masks/1.HEIC.png",
         tmp_path / "masks/2.avif.png",
     ]
+
+
+def test_masks_lie_on_the_way_to_the_photos_and_nowhere_else(tmp_path: Path) -> None:
+    photos = tmp_path / "dense/0/images"
+    write(tmp_path, "dense/0/images/1.jpg", "dense/0/masks/1.png", "old/masks/1.png", "dense/0/masks/old_masks/1.png")
+    found = find_masks([ColmapImage("1.jpg", 1, np.eye(4))], [photos / "1.jpg"], photos, tmp_path, ["masks"])
+    assert found == [tmp_path / "dense/0/masks/1.png"]
 
 
 def test_what_a_mac_leaves_beside_photos_is_none(tmp_path: Path) -> None:
