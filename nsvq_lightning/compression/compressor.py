@@ -365,14 +365,13 @@ class Compressor:
     def _train(self, setting: Setting) -> CompressedScene:
         """Select and quantize splats, and train what is left; in a few steps if Ctrl-C comes after other trainings."""
         try:
-            found = self._train_once(setting)
+            return self._train_once(setting)
         except KeyboardInterrupt:
             if self.stopped or not self.begun:
                 raise
             self.stopped = True
-            found = self._train_once(setting)
-        self.begun = True
-        return found
+        trim()  # now that the error does not hold what has failed
+        return self._train_once(setting)
 
     def _train_once(self, setting: Setting) -> CompressedScene:
         """Select and quantize splats, and train what is left."""
@@ -415,6 +414,7 @@ class Compressor:
         found = replace(module.compressed().finite(), origin=self.scene.origin, cameras=self.scene.cameras)
         del module
         trim()
+        self.begun = True
         return found
 
     @cached_property
@@ -437,8 +437,10 @@ class Compressor:
             own = Compressor(part, cameras, None, self.storage, self.seed, self.minutes * len(part) / 1e6, self.steps)
             own.stopped, own.begun = self.stopped, bool(found)
             left = max(1, setting.splats * len(part) // len(self.scene))
-            found.append(own._train(setting._replace(splats=left)))
-            self.stopped = own.stopped
+            try:
+                found.append(own._train(setting._replace(splats=left)))
+            finally:
+                self.stopped = own.stopped
             del own, part
             trim()
         return replace(CompressedScene.joined(found), cameras=self.scene.cameras)
