@@ -35,6 +35,12 @@ def slices(count: int) -> "Iterator[slice]":
         yield slice(start, start + splat.ROWS)
 
 
+def warn_of_activations(logits: Arrays) -> None:
+    """Warn where opacities of any shape, which should be logits, look like activations."""
+    if logits.size and 0 <= logits.min() < logits.max() <= 1:
+        log.warning("all opacities are in [0, 1]: logits are expected, and logarithms of scales")
+
+
 @dataclass(frozen=True, eq=False)
 class CompressedScene:
     """N splats, some of whose attributes are codes into codebooks.
@@ -144,6 +150,7 @@ class CompressedScene:
             raise ValueError(f"the splats have no {', '.join(sorted(missing))}")
         if "features_dc" in given and not rows.get("shN", rows["sh0"]).size:  # nerfstudio's of degree 0: logits
             rows["sh0"] = 0.5 * np.tanh(0.5 * rows["sh0"]) / conventions.SH_C0
+        warn_of_activations(rows["opacities"])
         return cls.from_rows(rows, **header)
 
     @classmethod
@@ -166,9 +173,6 @@ class CompressedScene:
             raise ValueError(f"shN must have shape [N, (degree + 1)^2 - 1, 3], got {list(rows['shN'].shape)}")
         for name, values in rows.items():
             found[name] = np.ascontiguousarray(values, np.float32).reshape(len(values), math.prod(values.shape[1:]))
-        logits = rows["opacities"]
-        if logits.size and 0 <= logits.min() < logits.max() <= 1:
-            log.warning("all opacities are in [0, 1]: logits are expected, and logarithms of scales")
         # Opacities of exactly 0 and 1 are infinite logits, lengths of 0 logarithms of -inf.
         found["scales"] = finite_logs(found["scales"])
         return cls(

@@ -32,7 +32,7 @@ def finite_logits(logits: Float32s) -> Float32s:
 def logits_of(opacities: Floats) -> Float32s:
     """Logits of opacities of any shape: finite in [0, 1], otherwise NaN.
 
-    Where more than a hundredth are negative, all are logits already.
+    Where more than a hundredth are negative, not by rounding, all are logits already.
     """
     if (opacities < 0).sum() > 0.01 * opacities.size:
         log.warning("opacities are negative: taken as logits")
@@ -60,9 +60,9 @@ def finite_logs(logs: Float32s) -> Float32s:
 def logs_of_lengths(lengths: Float32s) -> Float32s:
     """Logarithms of axis lengths of any shape, :data:`FLAT` where there is no length; NaN and infinite ones stay.
 
-    Where more than a hundredth are negative, all are logarithms already, as in ``.glb`` until the middle of 2026.
+    Where any is negative, all are logarithms already, as in ``.glb`` until the middle of 2026.
     """
-    if (lengths < 0).sum() > 0.01 * lengths.size:
+    if (lengths < 0).any():
         log.warning("scales are negative numbers: taken as logarithms of lengths")
         return lengths
     with np.errstate(divide="ignore"):

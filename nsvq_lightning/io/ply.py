@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from nsvq_lightning.io.atomic import StrPath, atomic_write
-from nsvq_lightning.io.compressed import CompressedScene, slices
+from nsvq_lightning.io.compressed import CompressedScene, slices, warn_of_activations
 from nsvq_lightning.io.errors import FormatError, as_defect, naming_file, wrong_start
 from nsvq_lightning.io.numbers import FLAT, Clamped, finite_logs, logits_of, opacity_of
 from nsvq_lightning.io.placing import FAR
@@ -289,6 +289,8 @@ def read_ply(path: StrPath) -> CompressedScene:
     with naming_file(path):
         sh_degree = splat_degree(header)
     rows = (_read_packed if header.packed else _read_plain)(path, header, sh_degree)
+    if not header.packed:
+        warn_of_activations(rows["opacities"])
     means, origin = _near(rows["means"])
     return CompressedScene.from_rows({**rows, "means": means}, header.antialiased, origin=origin)
 

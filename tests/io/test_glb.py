@@ -178,7 +178,9 @@ def replaced(document: dict[str, Any], data: bytes, name: str, values: NDArray[A
 
 
 def test_lengths_that_are_logarithms_are_known_by_their_sign(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    scene = plain_scene(20, 0)  # some logarithms are above 0
+    scene = plain_scene(20, 0)
+    scene.values("scales")[:] += 9  # in centimetres few logarithms are below 0
+    scene.values("scales")[5, 1] = -0.5
     save(scene, tmp_path / "x.glb")
     document, data = parts(tmp_path / "x.glb")
     logs = scene.values("scales").copy()
