@@ -22,9 +22,6 @@ from nsvq_lightning.commands import say
 from nsvq_lightning.commands.arguments import positive
 from nsvq_lightning.io.atomic import write_text
 
-# Bytes a photo that COLMAP needs, about.
-MIN_FREE = 2e6
-
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Add what ``nsvq prepare`` takes."""
@@ -91,7 +88,7 @@ def run(options: Namespace) -> int:
     if in_place and max(head.orientation for head in heads.values()) >= ON_ITS_SIDE:
         remarks.append("some photos are stored on their side, as the scene will be: give them from another folder")
     say(*remarks, *reconstruct.oddities(heads))
-    if shutil.disk_usage(scene).free < MIN_FREE * len(heads):
+    if shutil.disk_usage(scene).free < 2e6 * len(heads):
         say(f"the disk of {scene} is nearly full: COLMAP takes about 2 MB a photo, and may end without saying why")
     before = {*reconstruct.stamps_in(scene), *reconstruct.stamps_in(scene / "sparse")}
     verdict = reconstruct.reconstruct(scene, heads, report, is_video, options.max_size, options.threads)

@@ -3,6 +3,7 @@
 import json
 import re
 from argparse import ArgumentError
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -197,11 +198,12 @@ def check_config(path: str) -> dict[str, Any]:
     class Loader(yaml.SafeLoader):  # type: ignore[misc]
         """Refuses names that stand twice, of which YAML's own takes the last one without a word."""
 
-        def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
-            names = [key.value for key, _ in node.value]
-            if twice := [name for name in names if names.count(name) > 1]:
-                raise ValueError(f"line {node.start_mark.line + 1} begins a part that has {twice[0]} twice")
-            return super().construct_mapping(node, deep)
+        def compose_mapping_node(self, anchor: Any) -> Any:
+            node = super().compose_mapping_node(anchor)
+            names = Counter(key.value for key, _ in node.value if key.tag.endswith(":str"))
+            for name in [name for name, uses in names.items() if uses > 1][:1]:
+                raise ValueError(f"line {node.start_mark.line + 1} begins a part that has {name} twice")
+            return node
 
     file = Path(path)
     if not file.is_file():

@@ -143,7 +143,8 @@ def check_fit(text: str, first: Array | Tensor, *others: Array | Tensor | None, 
             raise TypeError(f"{name} must be {kind}, got {each.dtype}; convert it")
         shape = tuple(map(known.setdefault, dims, each.shape))
         if len(dims) != each.ndim or shape != each.shape or each.device != first.device:
-            expected = f"[{', '.join(dims)}] = {list(shape)} on {first.device}"
+            told = [f"{dim} = {known[dim]}" for dim in dims if dim in known and dim not in _NUMBERS]
+            expected = f"[{', '.join(dims)}] on {first.device} ({', '.join(told)})"
             raise ValueError(f"{name} must have shape {expected}, got {list(each.shape)} on {each.device}")
         if not (each.is_contiguous() if isinstance(each, Tensor) else each.flags.c_contiguous):
             raise ValueError(f"{name} must be contiguous; pass a copy")

@@ -298,7 +298,6 @@ def load_scene(
         raise ValueError(f"max_width must be None or at least 1 pixel, got {max_width}")
     if not test_every or test_every < 2:
         raise ValueError(f"test_every must be at least 2 (1 leaves no train view), got {test_every}")
-    images_folder = images_folder or "images"  # null in a config
     root = Path(root).expanduser()
     poses = read_poses(root, model, allow_outside=allow_outside)
     if model is None and poses.source == "COLMAP" and (larger := larger_models(root)):
@@ -324,8 +323,8 @@ def load_scene(
             f"all {len(test)} test photos end in {last[test[0]]}, as those of one camera of a rig: what it shows is "
             f"not trained on; --data.test_every={test_every + 1} takes turns"
         )
-    if images_folder == "images":
-        images_folder = poses.images_folder or images_folder
+    if images_folder in (None, "images"):
+        images_folder = poses.images_folder or "images"
     folder, divisor = photo_folder(root, images_folder, factor, names)
     found = locate(names, folder, f"the {poses.source} model of {root}", allow_outside)
     files = [found[name] for name in names]

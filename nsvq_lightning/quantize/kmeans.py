@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
 from nsvq_lightning.compute.jit import parallel, thread_count
-from nsvq_lightning.compute.memory import flat
+from nsvq_lightning.compute.memory import check_fit, flat
 from nsvq_lightning.compute.rows import put_rows, share
 from nsvq_lightning.quantize.nearest import nearest
 from nsvq_lightning.splats.splats import distinct_rows
@@ -42,12 +42,13 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
 
     Raises:
         ValueError: The values are not ``[N, D]``, or there is not one code per row.
-        TypeError: The values are neither float32 nor float64.
+        TypeError: The values are neither float32 nor float64, or the codes not int64.
     """
     if values.dim() != 2 or codes.shape != values.shape[:1]:
         raise ValueError(f"values must be [N, D] and codes [N], got {list(values.shape)} and {list(codes.shape)}")
     if values.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"values must be float32 or float64, got {values.dtype}")
+    check_fit("codes [N] int64", codes.contiguous())
     values, dtype = values.detach(), dtype or values.dtype
     if kernels_for(values) == "cuda":
         from nsvq_lightning.quantize.cuda.substitution import sum_rows

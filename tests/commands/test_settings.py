@@ -116,6 +116,12 @@ def test_a_config_may_use_aliases(tmp_path: Path) -> None:
     assert check_config(str(path)) == {"a": {"b": [1, 2]}, "c": {"b": [1, 2]}}
 
 
+def test_what_is_merged_does_not_stand_twice(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("a: &a {x: 1}\nb: {c: &b {<<: *a, x: 2}}\nmodel: {<<: *b, y: 3}\nd: {1: 2, '1': 3}\n")
+    assert check_config(str(path))["model"] == {"x": 2, "y": 3}
+
+
 def test_a_config_that_does_not_exist_is_refused_early() -> None:
     with pytest.raises(argparse.ArgumentError, match=r"there is no config papr; did you mean paper\?\nShipped ones: "):
         check_early(["fit", "--config=papr"])
