@@ -201,8 +201,8 @@ def check_config(path: str) -> dict[str, Any]:
         def compose_mapping_node(self, anchor: Any) -> Any:
             node = super().compose_mapping_node(anchor)
             names = Counter(key.value for key, _ in node.value if key.tag.endswith(":str"))
-            for name in [name for name, uses in names.items() if uses > 1][:1]:
-                raise ValueError(f"line {node.start_mark.line + 1} begins a part that has {name} twice")
+            if twice := next((name for name, uses in names.items() if uses > 1), ""):
+                raise ValueError(f"line {node.start_mark.line + 1} begins a part that has {twice} twice")
             return node
 
     file = Path(path)

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from nsvq_lightning.io.errors import LFS
+from nsvq_lightning.io.errors import LFS, POINTER
 from nsvq_lightning.splats.conventions import Float64s
 
 # Camera models in the order of COLMAP's numbers, and how many parameters each has.
@@ -146,7 +146,7 @@ def _records(path: Path, record: Callable[[mmap.mmap, int], tuple[_Row, int]]) -
         raise ValueError(f"it has {size} bytes, too few for a COLMAP table")
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         if data[: len(LFS)] == LFS:
-            raise ValueError("it is a pointer of Git LFS, not the file itself: get it by 'git lfs pull'")
+            raise ValueError(f"it is {POINTER}")
         (count,) = _U64.unpack_from(data, 0)
         end = _U64.size
         for row in range(1, count + 1):

@@ -23,7 +23,7 @@ from nsvq_lightning.compute.devices import to_device
 from nsvq_lightning.data.colmap import Pinhole, SceneError
 from nsvq_lightning.data.undistortion import Undistortion
 from nsvq_lightning.io.atomic import make_folder_of, write_bytes
-from nsvq_lightning.io.errors import LFS
+from nsvq_lightning.io.errors import LFS, POINTER
 from nsvq_lightning.splats.conventions import Arrays, Bools, Uint8s
 from nsvq_lightning.top_level import log
 
@@ -114,7 +114,7 @@ def head_for(path: Path, expected: Size, as_shown: bool = False) -> ImageHead:
 def _undecodable(path: Path, reason: str) -> SceneError:
     with suppress(OSError), path.open("rb") as file:
         if file.read(len(LFS)) == LFS:
-            reason = "a pointer of Git LFS, not the file itself: get it by 'git lfs pull'"
+            reason = POINTER
     return SceneError(f"image {path} cannot be decoded ({reason}): copy it again, or remove it and run COLMAP again")
 
 

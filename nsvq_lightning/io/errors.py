@@ -41,8 +41,9 @@ def naming_file(path: StrPath) -> Iterator[None]:
         raise FormatError(f"{path}: {error.defect}", error.remedy) from None
 
 
-# How a file begins that Git LFS has not fetched.
+# How a file begins that Git LFS has not fetched, and what is wrong with it where the format is not known.
 LFS = b"version https://git-lfs"
+POINTER = "a pointer of Git LFS, not the file itself: get it by 'git lfs pull'"
 
 
 def wrong_start(suffix: str, data: bytes, magic: bytes) -> FormatError:

@@ -66,7 +66,7 @@ def logs_of_lengths(lengths: Float32s) -> Float32s:
         log.warning("scales are negative numbers: taken as logarithms of lengths")
         return lengths
     with np.errstate(divide="ignore"):
-        return finite_logs(np.log(lengths.clip(np.float32(0))))
+        return finite_logs(np.log(lengths.clip(np.float32(0))))  # of whole numbers, too, in float32
 
 
 # What float32 rounding may add to a distance of one half.

@@ -289,8 +289,6 @@ def read_ply(path: StrPath) -> CompressedScene:
     with naming_file(path):
         sh_degree = splat_degree(header)
     rows = (_read_packed if header.packed else _read_plain)(path, header, sh_degree)
-    if not header.packed:
-        warn_of_activations(rows["opacities"])
     means, origin = _near(rows["means"])
     return CompressedScene.from_rows({**rows, "means": means}, header.antialiased, origin=origin)
 
@@ -334,6 +332,7 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
         wider = np.log(np.hypot(np.exp(rows["scales"]), widths))
         kept = np.exp((rows["scales"] - wider).sum(1, keepdims=True))
         rows |= {"scales": wider, "opacities": logits_of(kept * opacity_of(rows["opacities"]))}
+    warn_of_activations(rows["opacities"])
     return rows
 
 

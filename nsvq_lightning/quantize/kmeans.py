@@ -48,12 +48,12 @@ def sum_by_code(values: Tensor, codes: Tensor, num_codes: int, dtype: torch.dtyp
         raise ValueError(f"values must be [N, D] and codes [N], got {list(values.shape)} and {list(codes.shape)}")
     if values.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"values must be float32 or float64, got {values.dtype}")
-    check_fit("codes [N] int64", codes.contiguous())
     values, dtype = values.detach(), dtype or values.dtype
     if kernels_for(values) == "cuda":
         from nsvq_lightning.quantize.cuda.substitution import sum_rows
 
         return sum_rows(values, codes, num_codes, dtype)
+    check_fit("codes [N] int64", codes.contiguous())
     sums = torch.zeros(num_codes, values.shape[1], dtype=dtype)
     _sum_rows(thread_count(), values.cpu().contiguous().numpy(), flat(codes.cpu()), sums.numpy())
     return sums.to(values.device)
