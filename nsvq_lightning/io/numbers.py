@@ -60,9 +60,9 @@ def finite_logs(logs: Float32s) -> Float32s:
 def logs_of_lengths(lengths: Float32s) -> Float32s:
     """Logarithms of axis lengths of any shape, :data:`FLAT` where there is no length; NaN and infinite ones stay.
 
-    Where any is negative, all are logarithms already, as in ``.glb`` until the middle of 2026.
+    Where more than a hundredth are negative, all are logarithms already, as in ``.glb`` until the middle of 2026.
     """
-    if (lengths < 0).any():
+    if np.count_nonzero(lengths < 0) > lengths.size / 100:
         log.warning("scales are negative numbers: taken as logarithms of lengths")
         return lengths
     with np.errstate(divide="ignore"):

@@ -176,11 +176,11 @@ class _Archive:
             self.meta["count"] = shape[0] if isinstance(shape, list) and shape else None
         self.count = self._integer(self.meta, "count", 0, 1 << 40)
         check_room("splats", self.count, self._size)
-        if "shN" in self.meta and "count" not in self._entry("shN"):  # its picture shows how large the palette is
+        if self.meta.get("shN") and "count" not in self._entry("shN"):  # its picture shows how large the palette is
             height, width = self._picture("shN", 0).shape[:2]
             bands = {_ROWS_A_LINE * sh_coefficients(degree): degree for degree in (1, 2, 3)}.get(width)
             self.meta["shN"] |= {"bands": bands, "count": min(_ROWS_A_LINE * height, PALETTE_LIMIT)}
-        self.sh_degree = self._integer(self._entry("shN"), "bands", 0, 3) if "shN" in self.meta else 0
+        self.sh_degree = self._integer(self._entry("shN"), "bands", 0, 3) if self.meta.get("shN") else 0
 
     def _bytes(self, name: str, most: int) -> bytes:
         entry = self._zip.NameToInfo.get(name)

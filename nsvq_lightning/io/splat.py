@@ -78,7 +78,7 @@ def read_splat(path: StrPath) -> CompressedScene:
         {
             "means": records["means"],
             "quats": (records["quats"].astype(np.float32) - 128) / 128,
-            "scales": logs_of_lengths(records["lengths"].clip(0)),
+            "scales": logs_of_lengths(records["lengths"]),
             "opacities": logits_of_bytes(colors[:, 3]),
             "sh0": (colors[:, :3] / 255 - 0.5) / SH_C0,
         }

@@ -15,12 +15,30 @@ from nsvq_lightning import Splats, load, save
 from nsvq_lightning.io import CompressedScene, FormatError, describe, read_scene
 from nsvq_lightning.io.compressed import on_white
 from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.io.numbers import logs_of_lengths
 from nsvq_lightning.random import generator
 
 
 def scene(n: int, degree: int) -> Splats:
     shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, (degree + 1) ** 2 - 1, 3))
     return Splats.from_tensors(*(torch.randn(s, generator=generator(1, i)) for i, s in enumerate(shapes)))
+
+
+def test_lengths_are_logarithms_where_more_than_a_few_are_negative(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    logs = np.log(np.random.default_rng(0).uniform(0.01, 0.1, (300, 3))).astype(np.float32)
+    lengths = np.exp(logs)
+    lengths[7, 1] = -1e-9  # as by rounding
+    np.testing.assert_allclose(np.delete(logs_of_lengths(lengths), 7, 0), np.delete(logs, 7, 0), rtol=1e-5)
+    assert logs_of_lengths(lengths)[7, 1] == -20
+    assert len(logs_of_lengths(lengths[:0])) == 0
+    assert not caplog.messages
+    record = np.zeros(300, [("means", "<f4", 3), ("lengths", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
+    record["lengths"], record["colors"], record["quats"] = logs, 200, [255, 128, 128, 128]
+    (tmp_path / "x.splat").write_bytes(record.tobytes())
+    np.testing.assert_allclose(read_scene(tmp_path / "x.splat").values("scales"), logs)
+    assert "taken as logarithms" in caplog.text
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".NSVQ", ".Ply"])

@@ -125,6 +125,13 @@ def test_the_size_of_a_palette_may_be_that_of_its_picture(tmp_path: Path) -> Non
     np.testing.assert_array_equal(found.rows("shN"), whole.rows("shN"))
 
 
+def test_null_in_place_of_a_palette_is_none(tmp_path: Path) -> None:
+    meta, files = contents(plain_scene(COUNT, 0), tmp_path)
+    found = read_scene(bundled(tmp_path / "y.sog", meta | {"shN": None}, files))
+    np.testing.assert_array_equal(found.rows("sh0"), read_scene(tmp_path / "x.sog").rows("sh0"))
+    assert found.sh_degree == 0
+
+
 @pytest.mark.parametrize(("kind", "below"), [("PNG", ""), ("WEBP", ""), ("WEBP", "pictures/")])
 def test_a_folder_of_pictures(tmp_path: Path, kind: str, below: str) -> None:
     meta, files = contents(coded_scene(COUNT, 1), tmp_path)
