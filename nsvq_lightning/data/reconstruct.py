@@ -383,12 +383,12 @@ def _rows(scene: Path, query: str, *parameters: str) -> list[tuple[Any, ...]]:
 
 # Suffixes of photos that are converted if Pillow reads them, and of raw files.
 CONVERTED = (".jfif", ".jpe", ".avif", ".heic", ".heif", ".hif", ".jxl", ".jp2", ".gif")
-RAW = (".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
+RAW = (".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2", ".srw", ".gpr", ".pef")
 # Suffixes of videos.
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
 # Names of folders that hold something else than photos, or the same photos again, and of files that are such.
 OTHER = re.compile(
-    r"\..*|__MACOSX|(.*_)?(masks?|depths?|normals?|semantics)|conf(idence)?|depth_?maps|(un)?distorted|dense|"
+    r"\..*|__MACOSX|@eaDir|#recycle|\$RECYCLE\.BIN|(.*_)?(masks?|depths?|normals?|semantics)|conf(idence)?|depth_?maps|(un)?distorted|dense|"
     r"corrected_images|\.?thumb.*|images_\d+|[248]x|sparse|runs",
     re.IGNORECASE,
 )
@@ -423,7 +423,8 @@ def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
             continue
         left[reason].append(str(inside))
     if not taken:
-        raise SceneError(f"{folder}: no photos; it must hold files that end in {', '.join(PHOTOS)}, or folders of them")
+        holds = f"it must hold files that end in {', '.join(PHOTOS)}, or folders of them; a video is given by itself"
+        raise SceneError(f"{folder}: no photos; {holds}")
     return sorted(taken.values()), left
 
 
@@ -453,7 +454,7 @@ def copy_photos(photos: Sequence[Path], source: Path, folder: Path, report: Repo
             names.append(_copy(path, folder / inside).relative_to(folder).as_posix())
         except DAMAGED as error:
             known = path.suffix.lower() in PHOTOS
-            why, _, _ = str(error).partition(" '")  # Pillow's names the file
+            why = re.split(" ['\"]", str(error))[0]  # Pillow's names the file
             left[f"cannot be read ({why})" if known else TO_CONVERT].append(str(inside))
         report("copying photos", count, len(photos))
     return names, left
@@ -549,8 +550,6 @@ def write_frames(video: Path, folder: Path, count: int, report: Report) -> list[
     total = int(cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FRAME_COUNT))
     if total <= 0:  # some containers do not say
         total = sum(1 for _ in _frames(video, lambda _: None))
-    if not total:
-        raise SceneError(f"{video}: no frame can be read; convert it with 'ffmpeg -i {video.name} converted.mp4'")
     names = []
     last = None
     number = 0
@@ -564,6 +563,8 @@ def write_frames(video: Path, folder: Path, count: int, report: Report) -> list[
         written = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
         write_bytes(folder / names[-1], written.tobytes())
         last = tiny
+    if not names:
+        raise SceneError(f"{video}: no frame can be read; convert it with 'ffmpeg -i {video.name} converted.mp4'")
     if number + total / count < 0.9 * total:
         log.warning(f"{video} ends near frame {number} of {total}: copy it again, or convert it with ffmpeg")
     return names

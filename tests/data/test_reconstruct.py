@@ -87,6 +87,14 @@ def test_what_is_no_video_is_told(tmp_path: Path) -> None:
         write_frames(tmp_path / "a.mp4", tmp_path, 10, _silent)
 
 
+def test_frames_that_cannot_be_decoded_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those of AV1: OpenCV counts them, and reads none."""
+    video = _video(tmp_path / "a.mp4", [_texture(20 * k) for k in range(12)])
+    monkeypatch.setattr(cv2.VideoCapture, "read", lambda _: (False, None), raising=False)
+    with pytest.raises(SceneError, match=r"a\.mp4: no frame can be read; convert it"):
+        write_frames(video, tmp_path, 4, _silent)
+
+
 @pytest.fixture
 def folders(tmp_path: Path) -> tuple[Path, Path]:
     (tmp_path / "from").mkdir()
@@ -314,6 +322,11 @@ def test_what_apps_export_beside_photos_is_left_out(tmp_path: Path) -> None:
     others = ("dense/0/images/1.jpg", "undistorted/images/1.jpg", "depth_maps/1.png", "semantics/1.png", "conf/1.png")
     _touch(tmp_path / "odm", "images/1.jpg", *others)
     assert _names_in(tmp_path / "odm")[0] == ["images/1.jpg"]
+    thumbs = ("day/@eaDir/1.jpg/SYNOPHOTO_THUMB_XL.jpg", "#recycle/2.jpg", "$RECYCLE.BIN/3.jpg")
+    _touch(tmp_path / "nas", "day/1.jpg", *thumbs)
+    assert _names_in(tmp_path / "nas")[0] == ["day/1.jpg"]
+    _touch(tmp_path / "samsung", "1.jpg", "2.SRW", "3.gpr")
+    assert _names_in(tmp_path / "samsung")[0] == ["1.jpg", "2.SRW", "3.gpr"]
 
 
 def test_lenses_are_told_by_zoom_and_in_any_format(tmp_path: Path) -> None:
@@ -377,7 +390,7 @@ def test_copies_in_folders_keep_their_names(folders: tuple[Path, Path]) -> None:
 
 def test_folders_without_photos_are_refused(tmp_path: Path) -> None:
     _touch(tmp_path, "masks/a.png", "notes.txt")
-    with pytest.raises(SceneError, match="no photos; it must hold files that end in"):
+    with pytest.raises(SceneError, match=r"no photos; it must hold files that end in .* a video is given by itself"):
         photos_in(tmp_path)
 
 
