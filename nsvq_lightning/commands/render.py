@@ -15,6 +15,7 @@ import re
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from dataclasses import replace
 from pathlib import Path
+from statistics import mode
 from typing import TYPE_CHECKING
 
 from tqdm import tqdm
@@ -122,7 +123,7 @@ def _path(
             raise ValueError(f"--path {kind} needs cameras of photos: name their folder (--data.root), or take orbit")
         log.info("no photos: cameras are guessed from the scene (-y is up); --data.root names their folder")
         cameras = likely_cameras(splats, 24)
-    width, height = options.size or cameras[0].size
+    width, height = options.size or mode(camera.size for camera in cameras)
     if is_video and (width % 2 or height % 2):
         width, height = max(2, width - width % 2), max(2, height - height % 2)
         log.info(f"videos have even sides: {width}x{height}")

@@ -52,6 +52,15 @@ def test_cameras_of_the_photos_see_what_they_render(
     assert f"{out / '00005.png'}, and what may follow, are frames of an earlier render" in caplog.text
 
 
+def test_pictures_have_the_size_of_most_photos(scene: Path, demo_scene: Path, tmp_path: Path) -> None:
+    cameras = [
+        replace(camera, width=50) if not k else camera for k, camera in enumerate(load_scene(demo_scene).cameras)
+    ]
+    write_cameras(tmp_path / "cameras.json", {f"{k}.jpg": camera for k, camera in enumerate(cameras)})
+    assert _run(scene, "--path", "cameras", "-o", tmp_path / "frames") == 0
+    assert _picture(tmp_path / "frames" / "00000.png").shape == (72, 96, 3)
+
+
 def test_a_run_knows_its_photos(scene: Path, demo_scene: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     run.mkdir()
