@@ -62,7 +62,7 @@ def write_page(
     parts = {
         "figures": "".join(f"<div>{name}<b>{value}</b></div>" for name, value in facts),
         "how": "measured on the decoded file" if metrics else "as a file written at that moment would decode to",
-        "refresh": "" if metrics else '<meta http-equiv="refresh" content="5">',
+        "refresh": "" if metrics else '<noscript><meta http-equiv="refresh" content="5"></noscript>',
         "viewer": '<a class="button" href="viewer.html">Open viewer.html</a>' if viewer.exists() else "",
     }
     text = fill("report", title=title, sections="\n".join(shown), versions=escape(versions), **parts)

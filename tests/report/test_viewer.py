@@ -301,6 +301,22 @@ def test_the_list_of_cameras_keeps_the_keyboard(tab: Page, page: Path) -> None:
 
 
 @needs_chromium
+def test_a_graphics_device_that_comes_back_shows_the_same(tab: Page, page: Path) -> None:
+    _shown(tab, page.as_uri(), 97, 64)
+    drawn = "nsvqViewer.camera(nsvqViewer.camera()).then(nsvqViewer.picture)"
+    before = tab.run(drawn)
+    for name in ("canvas", "message"):
+        tab.run(f"globalThis.{name} = document.getElementById('{name}'); true")
+    tab.run(
+        "globalThis.device = canvas.getContext('webgl2').getExtension('WEBGL_lose_context'); device.loseContext(); 1"
+    )
+    words = "new Promise((resolve) => setTimeout(resolve, 300)).then(() => message.hidden ? '' : message.textContent)"
+    assert "taken away" in tab.run(words)
+    assert tab.run(f"device.restoreContext(); {words}") == ""
+    assert tab.run(drawn) == before
+
+
+@needs_chromium
 def test_keyframes_become_a_camera_path(tab: Page, page: Path) -> None:
     _shown(tab, page.as_uri(), 97, 64)
     poses = []

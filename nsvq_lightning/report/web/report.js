@@ -77,8 +77,11 @@ function draw(curve, { history, phases }) {
     const words = `iteration ${full.format(iteration)}: ${psnr.toFixed(2)} dB, ${full.format(splats)} splats`;
     parts.push(`<circle class="psnr" cx="${x(iteration)}" cy="${on(decibels, psnr)}" r="3.5"><title>${words}</title></circle>`);
   }
-  curve.innerHTML = `<svg role="img" aria-label="PSNR and splats by iteration" width="${width}" height="${height}">${parts.join("")}</svg>`;
+  curve.innerHTML = `<svg role="img" aria-label="PSNR and splats by iteration" viewBox="0 0 ${width} ${height}" width="${width}">${parts.join("")}</svg>`;
 }
+
+// A run that trains: not while somebody reads its settings.
+if (document.head.querySelector("noscript")) setInterval(() => document.querySelector("details[open]") ?? location.reload(), 5000);
 
 const curve = document.getElementById("curve");
 if (curve) new ResizeObserver(() => draw(curve, trained)).observe(curve);

@@ -908,7 +908,16 @@ async function main() {
     moved();
   }, { passive: false });
 
-  canvas.addEventListener("webglcontextlost", () => say("The graphics device was taken away; reload the page."));
+  canvas.addEventListener("webglcontextlost", (event) => {
+    event.preventDefault(); // or it would never come back
+    say("The graphics device was taken away; reload the page if it does not come back.");
+  });
+  canvas.addEventListener("webglcontextrestored", () => {
+    renderer = new Renderer(canvas, splats);
+    sorted = null;
+    say("");
+    schedule();
+  });
   element("cameras").replaceChildren(...scene.cameras.map(({ name }, index) => new Option(name, index)));
   let pointed = false; // the arrow keys choose, too, and go on choosing
   element("cameras").addEventListener("pointerdown", () => (pointed = true));
@@ -920,7 +929,10 @@ async function main() {
   addEventListener("hashchange", () => say(follow()));
   canvas.addEventListener("pointerdown", () => say(""));
   element("embed").hidden = server;
-  new ResizeObserver(resize).observe(canvas);
+  new ResizeObserver(() => {
+    resize();
+    if (sorted) draw(share); // at once: browsers show the cleared canvas before the next frame
+  }).observe(canvas);
 
   window.nsvqViewer = {
     /** The present camera, or, given one of the same form, that one: a promise kept when it is drawn. */
