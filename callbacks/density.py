@@ -211,10 +211,6 @@ class DensityControl(Densification):
     """Opacities are reset to at most this."""
     white_reset: Whole = 500
     """Iteration of one more reset on a white background; 0 for none."""
-    prune_start: int = 16_000
-    """First pruning of the prune phase."""
-    prune_last: int = 20_000
-    """Last pruning of the prune phase."""
     prune_every: Whole = 1000
     """Interval of pruning in the prune phase; 0 never prunes."""
 
@@ -241,8 +237,8 @@ class DensityControl(Densification):
         phase = schedule.phase_at(iteration)
         if phase is Phase.WARMUP:
             return iteration in schedule.density_times(self.start, self.last, self.every)
-        if phase is Phase.PRUNE and self.prune_every:
-            return iteration in schedule.times(self.prune_start, self.prune_last, self.prune_every)
+        if phase is Phase.PRUNE and (every := self.prune_every):
+            return iteration in schedule.times(schedule.warmup_end + every, schedule.prune_end, every)
         return False
 
     def act(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:

@@ -38,6 +38,7 @@ class ExportScene(WritingCallback):
     """Suffixes without the dot; ``sog``, ``spz`` and ``splat`` are smaller files for viewers."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         known = [suffix.removeprefix(".") for suffix, entry in FORMATS.items() if entry.write]
         if unknown := sorted(set(self.formats) - set(known)):
             raise ValueError(f"unknown export formats {', '.join(unknown)}; choose from {', '.join(known)}")
@@ -118,9 +119,9 @@ class LiveScene(WritingCallback):
         self._running = not is_fast_dev_run(trainer)
         self._answered, self._next = viewer.live_asked(run_folder(trainer)), 0.0
 
-    def on_train_batch_end(self, trainer: Trainer, module: SplatModule, outputs: Any, *args: Any) -> None:
+    def after_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Answer a viewer."""
-        due = trainer.global_step % CHECKED_EVERY == 1 and time.monotonic() >= self._next
+        due = iteration % CHECKED_EVERY == 1 and time.monotonic() >= self._next
         if not (self._running and due and trainer.is_global_zero):
             return
         folder = run_folder(trainer)
@@ -130,7 +131,7 @@ class LiveScene(WritingCallback):
         began = time.monotonic()
         with module.stopwatch.paused(module.device):
             splats = module.scene.hard_splats(module.phase)
-            state = {"iteration": trainer.global_step, "of": trainer.max_steps, "phase": module.phase.name.lower()}
+            state = {"iteration": iteration, "of": trainer.max_steps, "phase": module.phase.name.lower()}
             if module.history:
                 state["psnr"] = f"{module.history[-1]['psnr']:.2f}"
             config = {"antialiased": module.antialiased, "background": module.background, "live": state}

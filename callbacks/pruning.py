@@ -40,6 +40,7 @@ class OpacityRegularization(SplatCallback):
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, *args: Any) -> None:
         """Turn the term on and off."""
+        super().on_train_batch_start(trainer, module, *args)
         module.loss_terms.pop("opacity", None)
         if self.is_due(module, trainer.global_step + 1):
             weight = module.schedule.strength(self.weight)

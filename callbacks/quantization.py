@@ -392,14 +392,13 @@ class FreezeCodes(SplatCallback):
         """Whether codes are frozen before this iteration."""
         return iteration == module.schedule.first_of(Phase.FINETUNE)
 
-    def on_train_batch_start(self, trainer: Trainer, module: SplatModule, *args: Any) -> None:
+    def before_step(self, trainer: Trainer, module: SplatModule, iteration: int) -> None:
         """Freeze when due, and again where splats have changed.
 
         Raises:
             RuntimeError: A codebook has never been placed.
         """
-        iteration = trainer.global_step + 1
-        if self.is_due(module, iteration) and first_time(self, "before", iteration):
+        if self.is_due(module, iteration):
             self._freeze(trainer, module, module.quantizers)
         elif stale := self._stale(module):
             if not self._warned:

@@ -216,6 +216,7 @@ class LearningRateDecay(SplatCallback):
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, *args: Any) -> None:
         """Scale the rates of this iteration."""
+        super().on_train_batch_start(trainer, module, *args)
         schedule = module.schedule
         start = schedule.ends[Phase.QUANTIZE] if self.start is None else schedule.iteration(self.start)
         end = schedule.ends[Phase.FINETUNE]

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from lightning.pytorch import Callback, LightningModule
+from runs import fit
 
 from nsvq_lightning import callbacks
 from nsvq_lightning.callbacks import (
@@ -25,6 +26,7 @@ from nsvq_lightning.callbacks import (
     FiniteCodes,
     FreezeCodes,
     LearningRateDecay,
+    LiveScene,
     MetricReport,
     OpacityRegularization,
     PhaseSchedule,
@@ -35,6 +37,7 @@ from nsvq_lightning.callbacks import (
     SplatSelection,
 )
 from nsvq_lightning.callbacks.base import SplatCallback
+from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Schedule
 
@@ -90,6 +93,24 @@ def test_hooks_run_once_an_iteration_also_with_accumulation_and_after_a_resume()
     play(resumed, 1, first=2)
     assert resumed.noted == [("after", 3)]
     assert resumed.state_dict() == whole.state_dict()
+
+
+@pytest.mark.parametrize(
+    ("kind", "hook"),
+    [
+        (LearningRateDecay, "before_step"),
+        (LiveScene, "before_step"),
+        (MetricReport, "before_step"),
+        (OpacityRegularization, "before_step"),
+        (FreezeCodes, "after_step"),
+    ],
+)
+def test_subclasses_may_act_at_each_step(demo_scene: Path, kind: type[SplatCallback], hook: str) -> None:
+    noted: list[int] = []
+    own: Any = type("Own", (kind,), {hook: lambda *arguments: noted.append(arguments[-1])})
+    module = SplatModule(sh_degree=0, codebooks=None)
+    fit(module, ColmapDataModule(str(demo_scene), factor=2), [PhaseSchedule(total=4), own()], 4)
+    assert noted == [1, 2, 3, 4]
 
 
 def test_numbers_of_numpy_become_plain_data_in_a_checkpoint(tmp_path: Path) -> None:

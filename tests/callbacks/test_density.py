@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,14 +13,14 @@ import torch
 from density_stage import EXTENT, Stage, make_splats
 from scipy.spatial.transform import Rotation
 
-from nsvq_lightning.callbacks import DensityControl
+from nsvq_lightning.callbacks import DensityControl, PhaseSchedule
 from nsvq_lightning.callbacks.density import add_view, split
 from nsvq_lightning.quantize import NSVQ
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.splats.splats import RawSplats
 from nsvq_lightning.training.row_ops import append_rows, keep_rows
-from nsvq_lightning.training.schedule import Schedule
+from nsvq_lightning.training.schedule import Phase, Schedule
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -129,6 +131,15 @@ def test_gradient_accumulation_neither_repeats_an_edit_nor_weakens_the_statistic
     assert stage.count == 3
     stage.step(600, view([1.1e-4, 0.0, 1.1e-4], [True] * 3))
     assert stage.count == 3
+
+
+@pytest.mark.parametrize("total", [900, 4500])
+def test_a_run_of_another_length_prunes_in_its_prune_phase_too(total: int) -> None:
+    module: Any = SimpleNamespace(schedule=PhaseSchedule().schedule(total))
+    start, end = (module.schedule.ends[phase] for phase in (Phase.WARMUP, Phase.PRUNE))
+    due = [iteration for iteration in range(start + 1, total + 1) if DensityControl().is_due(module, iteration)]
+    assert len(due) == 2
+    assert max(due) < end
 
 
 def test_huge_splats_go_only_after_iteration_3000() -> None:

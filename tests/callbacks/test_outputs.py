@@ -8,8 +8,9 @@ import torch
 from lightning.pytorch import Callback
 from runs import fit
 
-from nsvq_lightning.callbacks import LiveScene, PhaseSchedule
+from nsvq_lightning.callbacks import ExportScene, LiveScene, PhaseSchedule
 from nsvq_lightning.callbacks import outputs as live_callback
+from nsvq_lightning.callbacks.settings import Count
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.io import load
 from nsvq_lightning.io.compressed import CompressedScene
@@ -70,6 +71,15 @@ def test_splats_are_written_when_somebody_asks(demo_scene: Path, tmp_path: Path)
         for name, tensor in viewer.expected[index]._asdict().items():
             assert torch.equal(getattr(splats, name).detach(), tensor), (index, name)
     assert not (viewer.folder / REQUEST).exists()
+
+
+def test_an_export_checks_the_settings_of_a_subclass() -> None:
+    class Often(ExportScene):
+        every: Count = 1
+
+    assert Often(every=2).every == 2
+    with pytest.raises(ValueError, match="every must be at least 1, got 0"):
+        Often(every=0)
 
 
 def test_nobody_costs_no_file_and_changes_no_bit(demo_scene: Path, tmp_path: Path) -> None:
