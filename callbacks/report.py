@@ -1,11 +1,11 @@
 """Measure the run: curves while it trains, and the quality of the decoded file at the end."""
 
+from dataclasses import field
 from typing import Any
 
 import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
-from torchmetrics import Metric
 
 from nsvq_lightning.data.scene import View
 from nsvq_lightning.io.atomic import optional
@@ -17,6 +17,7 @@ from nsvq_lightning.quality.loss import apply_mask, ssim
 from nsvq_lightning.quality.metrics import build_lpips, color_corrected, eight_bit, psnr
 from nsvq_lightning.report import numbers, page, pictures
 from nsvq_lightning.top_level import log
+from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 from nsvq_lightning.training.run_scene import scene_of
@@ -78,13 +79,8 @@ class MetricReport(WritingCallback):
     pictures: bool = True
     """Write a picture of each test view."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._scene: CompressedScene | None = None
-        self._scores: list[Json] = []
-        self._lpips: Metric | None = None
-        self._lpips_reason: str | None = None
-        self._beside = TimesBeside()
+    _scene: CompressedScene | None = field(default=None, init=False)
+    _beside: TimesBeside = field(default_factory=TimesBeside, init=False)
 
     def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
         """Forget the times of an earlier fit of this process."""
@@ -100,7 +96,8 @@ class MetricReport(WritingCallback):
         return iteration > 0 and (iteration in module.schedule.ends or bool(every and iteration % every == offset))
 
     def on_train_batch_start(self, trainer: Trainer, module: SplatModule, *args: Any) -> None:
-        """Evaluate the last iteration, now that all callbacks have finished with it."""
+        """Evaluate the last iteration, now that all callbacks have finished with it, also if interrupted."""
+        super().on_train_batch_start(trainer, module, *args)
         if self.is_due(module, trainer.global_step):
             self._evaluate_once(trainer, module)
 
@@ -132,7 +129,9 @@ class MetricReport(WritingCallback):
                 with optional(folder / "preview.png") as path:
                     pictures.write_png(path, torch.cat([eight_bit(photo), image], dim=1))
 
-        mean_psnr, mean_ssim = numbers.evaluate(module.scene.render, splats, views, show)
+        mean_psnr, mean_ssim = numbers.evaluate(
+            module.scene.render, splats, views, show, lambda sums: sum_over_processes(trainer, sums)
+        )
         entry: Json = {
             "iteration": iteration,
             "phase": phase.name.lower(),
@@ -156,7 +155,7 @@ class MetricReport(WritingCallback):
 
     def on_test_start(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the file, read it back, and let the module test the decoded scene; a trial tests the one in memory."""
-        self._scene, self._scores = None, []
+        self._scene, self._scores = None, list[Json]()
         if is_fast_dev_run(trainer):
             return
         path = run_folder(trainer) / "scene.nsvq"

@@ -35,15 +35,20 @@ SMALLER = {"psnr_half": 2, "psnr_quarter": 4}
 
 @torch.no_grad()
 def evaluate(
-    render: Renderer, splats: SplatTensors, views: Iterable[View], show: Callable[[Tensor, Tensor], None] | None = None
+    render: Renderer,
+    splats: SplatTensors,
+    views: Iterable[View],
+    show: Callable[[Tensor, Tensor], None] | None = None,
+    reduce: Callable[[Tensor], Tensor] = lambda sums: sums,
 ) -> tuple[float, float]:
-    """Mean PSNR, dB, and SSIM of rendered views against their photos, over the views of all processes.
+    """Mean PSNR, dB, and SSIM of rendered views against their photos.
 
     Args:
         render: The rasterizer.
         splats: Raw attributes of what it renders.
         views: What to compare with.
         show: Called with the first image and its photo.
+        reduce: Adds the sums of other processes, which have other views.
 
     Raises:
         ValueError: There are no views.
@@ -57,8 +62,7 @@ def evaluate(
             show = None
         pair = eight_bit(image), eight_bit(view.image)
         sums += torch.stack([psnr(*pair, view.mask), ssim(*pair, view.mask).double(), sums.new_ones(())])
-    if torch.distributed.is_available() and torch.distributed.is_initialized():
-        torch.distributed.all_reduce(sums)
+    sums = reduce(sums)
     if sums[2] == 0:
         raise ValueError("there are no views to evaluate; the scene needs at least one test view")
     mean_psnr, mean_ssim = (sums[:2] / sums[2]).float().tolist()
