@@ -207,6 +207,8 @@ class SplatCLI(LightningCLI):
             cause: BaseException = error
             while cause.__cause__ is not None:  # the parser wraps the cause in what else it tried
                 cause = cause.__cause__
+            if isinstance(cause, LookupError | AttributeError | AssertionError | NameError):
+                raise cause from None  # a bug, here or in a class of the user's
             raise ValueError(" ".join(str(cause).split())) from error
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:

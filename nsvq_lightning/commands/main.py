@@ -250,14 +250,14 @@ def _hush() -> None:
 
 
 def _is_ours(error: BaseException) -> bool:
-    """Whether this package raised the error: its message then says what to do, and a traceback would only obscure it.
+    """Whether this package or Lightning raised the error: its message says what to do, a traceback would obscure it.
 
     Errors of other kinds are bugs of ours, for which the traceback matters.
     """
     if not isinstance(error, ValueError | TypeError | OSError | RuntimeError | ArithmeticError | ImportError):
         return False
     modules = [str(frame.f_globals.get("__name__")) for frame, _ in walk_tb(error.__traceback__)]
-    return modules[-1].startswith("nsvq_lightning.")
+    return modules[-1].startswith(("nsvq_lightning.", "lightning."))
 
 
 class BarHandler(logging.StreamHandler[TextIO]):

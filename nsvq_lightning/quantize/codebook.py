@@ -383,10 +383,11 @@ def as_quantizer(module: object) -> Quantizer:
             "nsvq_lightning.quantize.CodebookQuantizer, or offer the members of nsvq_lightning.quantize.Quantizer"
         )
     quantizer = cast(Quantizer, module)
-    if not isinstance(module, nn.Module) or not isinstance(quantizer.codebook, nn.Parameter):
+    bare = getattr(type(module), "forward", None) is nn.Module.forward  # which every module has
+    if bare or not isinstance(module, nn.Module) or not isinstance(quantizer.codebook, nn.Parameter):
         raise TypeError(
-            f"{type(module).__name__} is not a quantizer: it must be an nn.Module whose codebook is an nn.Parameter, "
-            "so that checkpoints carry it and the optimiser trains it"
+            f"{type(module).__name__} is not a quantizer: it must be an nn.Module with a forward, whose codebook is an "
+            "nn.Parameter, so that checkpoints carry it and the optimiser trains it"
         )
     others = [name for name, each in module.named_parameters() if each.requires_grad and each is not quantizer.codebook]
     if others:

@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 import numpy as np
 import torch
 from lightning.pytorch import LightningModule
-from lightning.pytorch.callbacks import StochasticWeightAveraging, WeightAveraging
+from lightning.pytorch.callbacks import ModelPruning, StochasticWeightAveraging, WeightAveraging
 from lightning.pytorch.utilities.model_helpers import _restricted_classmethod
 from torch import Generator, Tensor, nn
 
@@ -240,8 +240,9 @@ class SplatModule(LightningModule):
                 "would grow splats needlessly: leave it at 32-true, and the module as it is made"
             )
         for callback in self.trainer.callbacks:  # type: ignore[attr-defined]  # Lightning does not type it
-            if isinstance(callback, StochasticWeightAveraging | WeightAveraging):
-                raise ValueError(f"{type(callback).__name__} averages parameters, but splats come and go: leave it out")
+            if isinstance(callback, StochasticWeightAveraging | WeightAveraging | ModelPruning):
+                name, does = type(callback).__name__, "masks" if isinstance(callback, ModelPruning) else "averages"
+                raise ValueError(f"{name} {does} parameters, but splats come and go: leave it out")
         self.evaluation_splats = self.pixel_weights = None  # an interrupted evaluation or fit may have left some
         scene = run_scene.scene_of(self.trainer)
         if scene is not None:

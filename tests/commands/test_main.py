@@ -189,6 +189,7 @@ SCENE = ["--config=demo", "--callbacks.progress=null"]
         ("--trainer.logger=MLFlowLogger", "mlflow"),
         ("--trainer.accelerator=gpu", "No supported gpu backend found"),
         ("--model.quantizer=nn_modules.NoQuantizer", "NoQuantizer is not a quantizer; it lacks: codebook, codes"),
+        ("--seed_everything=-1", "-1 is not in bounds"),
     ],
 )
 def test_settings_that_cannot_be_are_one_line(
@@ -206,6 +207,16 @@ def test_settings_that_cannot_be_are_one_line(
     assert [line.partition(":")[0] for line in lines] == ["error", "(NSVQ_TRACEBACK=1 shows where)"]
     assert message in lines[0]
     assert sorted(path.name for path in tmp_path.iterdir() if path.name != "__pycache__") == ["nn_modules.py"]
+
+
+def test_a_bug_in_a_class_of_ones_own_shows_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "with_a_bug", raising=False)
+    Path("with_a_bug.py").write_text(
+        "from lightning.pytorch import Callback\nclass Bug(Callback):\n    def __init__(self): {}['first']\n"
+    )
+    with pytest.raises(KeyError, match="first"):
+        main(["fit", *SCENE, "--trainer.callbacks+=with_a_bug.Bug"])
 
 
 @pytest.mark.parametrize(

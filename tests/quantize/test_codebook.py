@@ -280,6 +280,14 @@ def test_what_a_quantizer_lacks_is_named() -> None:
         as_quantizer(object())
 
 
+def test_a_quantizer_needs_a_forward_of_its_own() -> None:
+    class Forgetful(NSVQ):
+        forward = nn.Module.forward
+
+    with pytest.raises(TypeError, match=r"Forgetful is not a quantizer: it must be an nn\.Module with a forward"):
+        as_quantizer(Forgetful(4, 3))
+
+
 def test_a_codebook_that_nothing_trains_is_refused() -> None:
     quantizer = NSVQ(4, 3)
     del quantizer.codebook

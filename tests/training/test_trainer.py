@@ -13,7 +13,7 @@ import pytest
 import torch
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.accelerators import CUDAAccelerator, MPSAccelerator
-from lightning.pytorch.callbacks import StochasticWeightAveraging, WeightAveraging
+from lightning.pytorch.callbacks import ModelPruning, StochasticWeightAveraging, WeightAveraging
 from lightning.pytorch.trainer.connectors import accelerator_connector
 from splat_scenes import random_splats
 
@@ -105,6 +105,13 @@ def test_averages_of_parameters_that_come_and_go_are_refused(
     settings: dict[str, Any] = {"accelerator": "cpu", "default_root_dir": tmp_path}
     with pytest.raises(ValueError, match="Averaging averages parameters, but splats come and go"):
         SplatTrainer(max_steps=2, callbacks=[average], **settings).fit(SplatModule(), ColmapDataModule(str(demo_scene)))
+
+
+def test_masks_of_parameters_are_refused_before_the_training(demo_scene: Path, tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"accelerator": "cpu", "default_root_dir": tmp_path}
+    masks = ModelPruning("l1_unstructured")
+    with pytest.raises(ValueError, match="ModelPruning masks parameters, but splats come and go"):
+        SplatTrainer(max_steps=2, callbacks=[masks], **settings).fit(SplatModule(), ColmapDataModule(str(demo_scene)))
 
 
 def test_validation_is_of_all_test_views(demo_scene: Path, tmp_path: Path) -> None:
