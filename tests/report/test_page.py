@@ -13,7 +13,11 @@ import numpy as np
 import pytest
 import torch
 from chromium import chromium, needs_chromium
+from splat_scenes import random_splats
 
+from nsvq_lightning.data.scene import load_scene
+from nsvq_lightning.rendering.rasterize import render
+from nsvq_lightning.report.numbers import evaluate
 from nsvq_lightning.report.page import write_page
 from nsvq_lightning.report.pictures import comparison, write_png
 from nsvq_lightning.training.schedule import Phase, Schedule
@@ -153,6 +157,23 @@ def test_page_of_a_running_fit_shows_a_view_and_is_read_again(run: Path) -> None
     assert preview.shape[1] == 1000
     assert preview[:, 450].max() < 8
     assert preview[:, 550].min() > 247
+
+
+def test_a_measurement_waits_for_no_other_process(demo_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A script may compress in one process of several: nobody else measures then."""
+
+    def waits(*_: Any) -> None:
+        raise AssertionError("the other processes never answer")
+
+    scene = load_scene(demo_scene)
+    views = [scene.view(index) for index in scene.test]
+    torch.distributed.init_process_group("gloo", store=torch.distributed.HashStore(), rank=0, world_size=1)
+    try:
+        monkeypatch.setattr(torch.distributed, "all_reduce", waits)
+        found = evaluate(render, random_splats(50), views)
+        assert evaluate(render, random_splats(50), views, reduce=lambda sums: 2 * sums) == found
+    finally:
+        torch.distributed.destroy_process_group()
 
 
 def test_of_many_views_the_page_has_the_lowest(run: Path) -> None:
