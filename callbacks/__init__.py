@@ -1,7 +1,8 @@
 """Lightning callbacks: everything in a run that happens at certain steps.
 
-Each decides from the schedule of a :class:`nsvq_lightning.SplatModule` and the trainer's step alone; none depends on
-another. :func:`standard` makes those of ``nsvq fit``.
+Each decides from the schedule of a :class:`nsvq_lightning.SplatModule` and the trainer's step alone, and none needs
+another. What one sets when a fit is set up is seen by those after it: :class:`SplatBudget` stands before the
+:class:`PhaseSchedule` whose ``minutes`` are to be of its splats. :func:`standard` makes those of ``nsvq fit``.
 """
 
 from .checkpoint import RunCheckpoint

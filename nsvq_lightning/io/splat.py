@@ -27,8 +27,8 @@ _RECORD = np.dtype([("means", "<f4", 3), ("lengths", "<f4", 3), ("colors", "u1",
 def write_splat(path: StrPath, scene: CompressedScene) -> int:
     """Write a scene as ``.splat``.
 
-    View-dependent colour is lost, colours outside [0, 1] are clamped, and splats with a non-finite value are left out,
-    each with a warning.
+    View-dependent colour is lost and colours outside [0, 1] are clamped, each with a warning. Splats with a non-finite
+    value are written as they are: :func:`nsvq_lightning.io.save` leaves them out.
 
     Returns:
         Bytes of the file.

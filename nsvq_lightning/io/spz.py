@@ -284,8 +284,8 @@ def write_spz(
 ) -> int:
     """Write a scene as ``.spz``.
 
-    Positions get as many fractional bits as the smallest splats need. Splats with a non-finite value are left out
-    and values out of the format's range are clamped, each with a warning.
+    Positions get as many fractional bits as the smallest splats need. Values out of the format's range are clamped,
+    with a warning; :func:`nsvq_lightning.io.save` leaves out splats with a value that is not finite.
 
     Args:
         path: File to write, replaced atomically.

@@ -1,7 +1,7 @@
 """The four phases of a run, and how the paper's iteration numbers scale to a shorter or longer run.
 
-Only this module decides what scales. Every other part of the package uses the paper's numbers (for a run of 45 000
-iterations) and asks the :class:`Schedule` for the numbers of this run.
+Only this module decides what scales. Every other part of the package uses numbers of a reference run (45 000 iterations
+in the paper, 15 000 in the recipe) and asks the :class:`Schedule` for the numbers of this run.
 """
 
 import math
