@@ -1,7 +1,7 @@
 """Entropy coding of paths down a tree, sorted keys, and integers: each to bytes and back.
 
 All three write binary decisions with :mod:`nsvq_lightning.io.nsvq.range_coder` and differ in the contexts by which the
-probability of a decision is kept.
+probability of a decision is kept. One kernel writes and reads: with ``reads`` None, what it is given, else into it.
 """
 
 from functools import partial
@@ -60,7 +60,7 @@ def encode_paths(paths: Int64s, bits: int, neighbours: Int32s) -> bytes:
     check_fit("paths [N] int64", paths, N=len(neighbours))
     contexts = _path_contexts(bits, neighbours, True)
     words = _room(len(paths) * bits)
-    return _bytes(words, _write_paths(paths, bits, neighbours, words, contexts))
+    return _bytes(words, _code_paths(paths, bits, neighbours, words, contexts, True, None))
 
 
 def _path_contexts(bits: int, neighbours: Int32s, two: bool) -> Uint32s:
@@ -86,7 +86,7 @@ def decode_paths(data: Bytes, bits: int, neighbours: Int32s, two: bool = True) -
     """
     contexts = _path_contexts(bits, neighbours, two)
     paths, words = np.empty(len(neighbours), np.int64), _words(data)
-    _check_used(words, _read_paths(words, bits, neighbours, paths, contexts, two))
+    _check_used(words, _code_paths(paths, bits, neighbours, words, contexts, two, True))
     return paths
 
 
@@ -106,7 +106,7 @@ def encode_keys(keys: Uint64s, depths: Int64s) -> bytes:
     if (keys[1:] < keys[:-1]).any() or (len(keys) and keys[-1] > _KEY_MASK):
         raise ValueError(f"keys must ascend and be below 2^{KEY_BITS}, got {keys}; sort them")
     words = _room(depths.sum() + 8 * len(keys))
-    return _bytes(words, _write_keys(keys, depths, words, rc.new_contexts(_KEY_CONTEXTS)))
+    return _bytes(words, _code_keys(keys, depths, words, rc.new_contexts(_KEY_CONTEXTS), None))
 
 
 def decode_keys(data: Bytes, depths: Int64s) -> Uint64s:
@@ -120,7 +120,7 @@ def decode_keys(data: Bytes, depths: Int64s) -> Uint64s:
     check_fit("depths [N] int64", depths)
     check_inside("depths", depths, KEY_BITS + 1)
     keys, words = np.empty(len(depths), np.uint64), _words(data)
-    used = _read_keys(words, depths, keys, rc.new_contexts(_KEY_CONTEXTS))
+    used = _code_keys(keys, depths, words, rc.new_contexts(_KEY_CONTEXTS), True)
     _check_used(words, used, "a position is outside its grid")
     return keys
 
@@ -154,7 +154,7 @@ def encode_integers(values: Integers, order: Int64s | None = None) -> bytes:
     # Differences of differences are to be below 2^53, too.
     modes = bits[: _MODES if largest < _TOO_LARGE >> 1 else 2].argmin(0).astype(np.uint8)
     words = _room(bits.min(0).sum() + 8 * values.size)
-    used = _write_integers(values, order, modes, words, rc.new_contexts(_INTEGER_CONTEXTS * values.shape[1]))
+    used = _code_integers(values, order, modes, words, rc.new_contexts(_INTEGER_CONTEXTS * values.shape[1]), None)
     return bytes(modes) + _bytes(words, used)
 
 
@@ -170,7 +170,7 @@ def decode_integers(data: Bytes, rows: int, columns: int) -> Int64s:
     if (modes >= _MODES).any():
         raise FormatError(f"damaged: a column of integers has mode {modes.max()}, the largest is {_MODES - 1}")
     values, words = np.empty((rows, columns), np.int64), _words(data[columns:])
-    used = _read_integers(words, modes, values, rc.new_contexts(_INTEGER_CONTEXTS * columns))
+    used = _code_integers(values, np.arange(rows), modes, words, rc.new_contexts(_INTEGER_CONTEXTS * columns), True)
     _check_used(words, used, "an integer is not below 2^52 in size")
     return values
 
@@ -190,7 +190,7 @@ def _bytes(words: Uint32s, used: int) -> bytes:
 def _words(data: Bytes) -> Uint32s:
     if len(data) % 4:
         raise FormatError(f"damaged: an entropy-coded stream of {len(data)} bytes, not a multiple of 4")
-    return np.frombuffer(data, "<u4").astype(np.uint32, copy=False)
+    return np.frombuffer(data, "<u4").astype(np.uint32)
 
 
 def _check_used(words: Uint32s, used: int, outside: str = "") -> None:
@@ -232,37 +232,23 @@ def _contexts_of(first, second, path, left, bits, two):  # type: ignore[no-untyp
 
 
 @_stream_kernel
-def _write_paths(paths, bits, neighbours, words, contexts):  # type: ignore[no-untyped-def]
-    state = rc.START
-    plain = max(0, bits - _MODELLED_BITS)
-    for i in range(len(paths)):
-        first, second = _path_of(paths, neighbours[i, 0]), _path_of(paths, neighbours[i, 1])
-        path = int64(0)
-        for left in range(bits - 1, plain - 1, -1):
-            bit = (paths[i] >> left) & 1
-            context, quick = _contexts_of(first, second, path, left, bits, True)
-            state = rc.encode_bit(bit, context, quick, contexts, state, words)
-            path = 2 * path + bit
-        state = rc.encode_plain(paths[i] & ((1 << plain) - 1), plain, state, words)
-    return rc.encode_end(state, words)
-
-
-@_stream_kernel
-def _read_paths(words, bits, neighbours, paths, contexts, two):  # type: ignore[no-untyped-def]
-    state = rc.decode_start(words)
+def _code_paths(paths, bits, neighbours, words, contexts, two, reads):  # type: ignore[no-untyped-def]
+    state = rc.start(words, reads)
     plain = max(0, bits - _MODELLED_BITS)
     for i in range(len(paths)):
         first, second = _path_of(paths, neighbours[i, 0]), _path_of(paths, neighbours[i, 1])
         path = int64(0)
         for left in range(bits - 1, plain - 1, -1):
             context, quick = _contexts_of(first, second, path, left, bits, two)
-            bit, state = rc.decode_bit(context, quick, contexts, state, words)
+            bit = (paths[i] >> left) & 1
+            bit, state = rc.code_bit(bit, context, quick, contexts, state, words, reads)
             path = 2 * path + bit
-        rest, state = rc.decode_plain(plain, state, words)
-        paths[i] = (path << plain) + int64(rest)
-        if _ended(words, state):
-            break
-    return state[2]
+        rest, state = rc.code_plain(paths[i], plain, state, words, reads)
+        if reads is not None:
+            paths[i] = (path << plain) + int64(rest)
+            if _ended(words, state):
+                break
+    return rc.end(state, words, reads)
 
 
 # Lengths of numbers
@@ -278,26 +264,11 @@ def _length(size):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _below(value, bits):  # type: ignore[no-untyped-def]
-    """The number without its bit ``bits - 1`` and those above."""
-    return value & ((uint64(1) << uint64(max(bits - 1, 0))) - uint64(1))
-
-
-@inline
-def _write_length(length, start, contexts, state, words):  # type: ignore[no-untyped-def]
-    node = 1
+def _code_length(length, start, contexts, state, words, reads):  # type: ignore[no-untyped-def]
+    node = int64(1)
     for left in range(_LENGTH_BITS - 1, -1, -1):
         bit = (length >> left) & 1
-        state = rc.encode_bit(bit, start + node, start + node, contexts, state, words)
-        node = 2 * node + bit
-    return state
-
-
-@inline
-def _read_length(start, contexts, state, words):  # type: ignore[no-untyped-def]
-    node = 1
-    for _ in range(_LENGTH_BITS):
-        bit, state = rc.decode_bit(start + node, start + node, contexts, state, words)
+        bit, state = rc.code_bit(bit, start + node, start + node, contexts, state, words, reads)
         node = 2 * node + bit
     return node - (1 << _LENGTH_BITS), state
 
@@ -305,48 +276,31 @@ def _read_length(start, contexts, state, words):  # type: ignore[no-untyped-def]
 # Keys
 
 
-@inline
-def _key_context(depth, before):  # type: ignore[no-untyped-def]
-    """First context of a key of this depth, after a difference with its highest bit at ``before``."""
-    return (depth * _BEFORE + before // 6) << _LENGTH_BITS
-
-
 @_stream_kernel
-def _write_keys(keys, depths, words, contexts):  # type: ignore[no-untyped-def]
-    state = rc.START
-    last, before = uint64(0), 0
+def _code_keys(keys, depths, words, contexts, reads):  # type: ignore[no-untyped-def]
+    state = rc.start(words, reads)
+    last, before = uint64(0), int64(0)
     for i in range(len(keys)):
         shift = uint64(KEY_BITS - depths[i])
-        step = (keys[i] >> shift) - (last >> shift)
-        length = _length(step)
-        start = _key_context(depths[i], before)
-        state = _write_length(length, start, contexts, state, words)
-        state = rc.encode_plain(_below(step, length), length - 1, state, words)
-        last = keys[i]
-        before = length + int64(shift) if length else 0
-    return rc.encode_end(state, words)
-
-
-@_stream_kernel
-def _read_keys(words, depths, keys, contexts):  # type: ignore[no-untyped-def]
-    state = rc.decode_start(words)
-    last, before = uint64(0), 0
-    for i in range(len(keys)):
-        shift = uint64(KEY_BITS - depths[i])
-        start = _key_context(depths[i], before)
-        length, state = _read_length(start, contexts, state, words)
+        step, length = uint64(0), int64(0)
+        if reads is None:
+            step = (keys[i] >> shift) - (last >> shift)
+            length = _length(step)
+        start = (depths[i] * _BEFORE + before // 6) << _LENGTH_BITS
+        length, state = _code_length(length, start, contexts, state, words, reads)
         if length > depths[i]:
             return _OUTSIDE
-        rest, state = rc.decode_plain(length - 1, state, words)
+        rest, state = rc.code_plain(step, length - 1, state, words, reads)
         step = (uint64(1) << uint64(length - 1)) | rest if length else uint64(0)
         last = ((last >> shift) + step) << shift  # of two numbers below 2^63: no carry is lost
         if last > _KEY_MASK:
             return _OUTSIDE
-        before = length + int64(shift) if length else 0
-        keys[i] = last
-        if _ended(words, state):
-            break
-    return state[2]
+        before = length + int64(shift) if length else int64(0)
+        if reads is not None:
+            keys[i] = last
+            if _ended(words, state):
+                break
+    return rc.end(state, words, reads)
 
 
 # Integers
@@ -363,43 +317,32 @@ def _expected(values, row, before, column, mode):  # type: ignore[no-untyped-def
 
 
 @_stream_kernel
-def _write_integers(values, order, modes, words, contexts):  # type: ignore[no-untyped-def]
-    state = rc.START
+def _code_integers(values, order, modes, words, contexts, reads):  # type: ignore[no-untyped-def]
+    state = rc.start(words, reads)
     for i in range(values.shape[0]):
-        for j in range(values.shape[1]):
-            before = order[i - 1] if i > 0 else -1
-            value = int64(values[order[i], j]) - _expected(values, order[i], before, j, modes[j])
-            size = uint64(abs(value))
-            length = _length(size)
-            start = _INTEGER_CONTEXTS * j
-            state = _write_length(length, start, contexts, state, words)
-            state = rc.encode_plain(value < 0, min(length, 1), state, words)
-            if length > 1:
-                second = int64(size >> uint64(length - 2)) & 1
-                context = start + (1 << _LENGTH_BITS) + length
-                state = rc.encode_bit(second, context, context, contexts, state, words)
-                state = rc.encode_plain(_below(size, length - 1), length - 2, state, words)
-    return rc.encode_end(state, words)
-
-
-@_stream_kernel
-def _read_integers(words, modes, values, contexts):  # type: ignore[no-untyped-def]
-    state = rc.decode_start(words)
-    for i in range(values.shape[0]):
+        row, before = order[i], order[i - 1] if i > 0 else -1
         for j in range(values.shape[1]):
             start = _INTEGER_CONTEXTS * j
-            length, state = _read_length(start, contexts, state, words)
-            sign, state = rc.decode_plain(min(length, 1), state, words)
-            size = uint64(min(length, 1))
+            expected = _expected(values, row, before, j, modes[j])
+            value, size, length = int64(0), uint64(0), int64(0)
+            if reads is None:
+                value = int64(values[row, j]) - expected
+                size = uint64(abs(value))
+                length = _length(size)
+            length, state = _code_length(length, start, contexts, state, words, reads)
+            sign, state = rc.code_plain(uint64(value < 0), min(length, 1), state, words, reads)
             if length > 1:
                 context = start + (1 << _LENGTH_BITS) + length  # of the bit after the leading one
-                second, state = rc.decode_bit(context, context, contexts, state, words)
-                rest, state = rc.decode_plain(length - 2, state, words)
+                second = int64(size >> uint64(length - 2)) & 1
+                second, state = rc.code_bit(second, context, context, contexts, state, words, reads)
+                rest, state = rc.code_plain(size, length - 2, state, words, reads)
                 size = ((uint64(2) | uint64(second)) << uint64(length - 2)) | rest
-            value = (-int64(size) if sign else int64(size)) + _expected(values, i, i - 1, j, modes[j])
-            if size >= uint64(2 * _TOO_LARGE) or not -_TOO_LARGE < value < _TOO_LARGE:
-                return _OUTSIDE
-            values[i, j] = value
+            if reads is not None:
+                size = size if length > 1 else uint64(length)
+                value = (-int64(size) if sign else int64(size)) + expected
+                if size >= uint64(2 * _TOO_LARGE) or not -_TOO_LARGE < value < _TOO_LARGE:
+                    return _OUTSIDE
+                values[row, j] = value
         if _ended(words, state):
             break
-    return state[2]
+    return rc.end(state, words, reads)

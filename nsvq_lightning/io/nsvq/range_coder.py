@@ -7,6 +7,9 @@ The probability of a bit is kept per *context* as a 16-bit number that moves tow
 at the n-th and finally by 1/128: as exact as a count at first, as adaptive as a running mean later. A bit may have two
 contexts, and the mean of their probabilities: one that knows much and moves by 1/62 in the end, and one that knows
 little and follows quickly, by 1/8.
+
+The functions write where ``reads`` is None, else they read, and the code of the other half is not there. Their state is
+``low, width, used``: a reader has in place of ``low`` how far above it the number is that the stream holds.
 """
 
 import numpy as np
@@ -23,8 +26,6 @@ SLOW_LIMIT, QUICK_LIMIT, TWO_START = 60, 6, 2
 
 _FULL = uint64(0xFFFFFFFFFFFFFFFF)
 _LOW_WORD = uint64(0xFFFFFFFF)
-# The state of a writer before the first bit; that of a reader has a number in the interval in place of its lower end.
-START = uint64(0), _FULL, 0
 # Largest number of bits written at once without a model.
 PLAIN_BITS = 16
 
@@ -72,108 +73,80 @@ def _carry(words, used):
 
 
 @inline
-def _shift_out(low, width, words, used):
-    """Write the upper word of an interval that has become narrow."""
-    if width <= _LOW_WORD:
-        words[used] = low >> uint64(32)
-        used += 1
-        low <<= uint64(32)
-        width <<= uint64(32)
-    return low, width, used
-
-
-@inline
-def encode_bit(bit, context, quick, contexts, state, words):
-    """Write a bit, of two contexts or of the same one twice; returns the new state ``low, width, used``.
-
-    Start with :data:`START`.
-    """
-    low, width, used = state
-    part = (width >> uint64(16)) * _chance(context, quick, contexts)
-    one = uint64(0) - uint64(bit)  # all bits set for 1, none for 0
-    before = low
-    low += part & ~one
-    width = (part & one) | ((width - part) & ~one)
-    if low < before:
-        _carry(words, used)
-    _learn_both(bit, context, quick, contexts)
-    return _shift_out(low, width, words, used)
-
-
-@inline
-def encode_plain(value, bits, state, words):
-    """Write the lower ``bits`` (0 to 62) of a number, each as likely 0 as 1; returns the new state."""
-    low, width, used = state
-    while bits > 0:
-        now = min(bits, PLAIN_BITS)
-        bits -= now
-        width >>= uint64(now)
-        before = low
-        low += width * ((uint64(value) >> uint64(bits)) & uint64((1 << now) - 1))
-        if low < before:
-            _carry(words, used)
-        low, width, used = _shift_out(low, width, words, used)
-    return low, width, used
-
-
-@inline
-def encode_end(state, words):
-    """Write the one word that identifies the last interval; returns the number of words."""
-    low, _, used = state
-    if low > _FULL - _LOW_WORD:
-        _carry(words, used)
-        words[used] = 0
-    else:
-        words[used] = (low + _LOW_WORD) >> uint64(32)
-    return used + 1
-
-
-@inline
 def _word(words, at):
     """A word of the stream; 0 beyond its end."""
     return uint64(words[at]) if at < len(words) else uint64(0)
 
 
 @inline
-def decode_start(words):
-    """The state ``code, width, used`` before the first bit."""
+def start(words, reads):
+    """The state before the first bit."""
+    if reads is None:
+        return uint64(0), _FULL, 0
     return (_word(words, 0) << uint64(32)) | _word(words, 1), _FULL, 2
 
 
 @inline
-def _shift_in(code, width, words, used):
+def _narrowed(low, step, width, used, words, reads):
+    """The state in a part of the interval, which begins a step higher; by a word further where that is narrow."""
+    if reads is None:
+        before = low
+        low += step
+        if low < before:
+            _carry(words, used)
+    else:
+        low -= step
     if width <= _LOW_WORD:
-        code = (code << uint64(32)) | _word(words, used)
+        if reads is None:
+            words[used] = low >> uint64(32)
+            low <<= uint64(32)
+        else:
+            low = (low << uint64(32)) | _word(words, used)
         width <<= uint64(32)
         used += 1
-    return code, width, used
+    return low, width, used
 
 
 @inline
-def decode_bit(context, quick, contexts, state, words):
-    """Read a bit; returns it and the new state."""
-    code, width, used = state
+def code_bit(bit, context, quick, contexts, state, words, reads):
+    """Write a bit, or read one, of two contexts or of the same one twice; returns it and the new state."""
+    low, width, used = state
     part = (width >> uint64(16)) * _chance(context, quick, contexts)
-    bit = int64(code < part)
-    one = uint64(0) - uint64(bit)
-    code -= part & ~one
+    if reads is not None:
+        bit = int64(low < part)
+    one = uint64(0) - uint64(bit)  # all bits set for 1, none for 0
     width = (part & one) | ((width - part) & ~one)
     _learn_both(bit, context, quick, contexts)
-    return bit, _shift_in(code, width, words, used)
+    return bit, _narrowed(low, part & ~one, width, used, words, reads)
 
 
 @inline
-def decode_plain(bits, state, words):
-    """Read a number of ``bits`` (0 to 62) bits; returns it and the new state."""
-    code, width, used = state
-    value = uint64(0)
+def code_plain(value, bits, state, words, reads):
+    """Write the lower ``bits`` (0 to 62) of a number, each as likely 0 as 1, or read them; returns both, too."""
+    low, width, used = state
+    found = uint64(0)
     while bits > 0:
         now = min(bits, PLAIN_BITS)
         bits -= now
         width >>= uint64(now)
-        # Only an altered stream exceeds the range.
-        digit = min(code // width, uint64((1 << now) - 1))
-        code -= digit * width
-        value = (value << uint64(now)) | digit
-        code, width, used = _shift_in(code, width, words, used)
-    return value, (code, width, used)
+        largest = uint64((1 << now) - 1)
+        digit = (uint64(value) >> uint64(bits)) & largest
+        if reads is not None:
+            digit = min(low // width, largest)  # only an altered stream exceeds the range
+        found = (found << uint64(now)) | digit
+        low, width, used = _narrowed(low, digit * width, width, used, words, reads)
+    return found, (low, width, used)
+
+
+@inline
+def end(state, words, reads):
+    """Write the one word that identifies the last interval; returns the number of words written, or read."""
+    low, _, used = state
+    if reads is not None:
+        return used
+    if low > _FULL - _LOW_WORD:
+        _carry(words, used)
+        words[used] = 0
+    else:
+        words[used] = (low + _LOW_WORD) >> uint64(32)
+    return used + 1
