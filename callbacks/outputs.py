@@ -42,7 +42,6 @@ class ExportScene(WritingCallback):
         known = [suffix.removeprefix(".") for suffix, entry in FORMATS.items() if entry.write]
         if unknown := sorted(set(self.formats) - set(known)):
             raise ValueError(f"unknown export formats {', '.join(unknown)}; choose from {', '.join(known)}")
-        self.formats = tuple(self.formats)
 
     def on_fit_end(self, trainer: Trainer, module: SplatModule) -> None:
         """Write the files, on the first process."""
@@ -78,14 +77,12 @@ class RenderWriter(BasePredictionWriter):
         self._target = Path()
 
     def on_predict_start(self, trainer: Trainer, module: SplatModule) -> None:
-        """Make the folder in a hook that all processes call: some have fewer views than others.
+        """Find the folder in a hook that all processes call: some have fewer views than others.
 
         Raises:
             FileExistsError: The folder of the run holds another one.
         """
         self._target = run_folder(trainer) / "predictions" if self.folder is None else Path(self.folder)
-        if not is_fast_dev_run(trainer):
-            self._target.mkdir(parents=True, exist_ok=True)
 
     def write_on_batch_end(self, trainer: Trainer, module: SplatModule, prediction: Any, *args: Any) -> None:
         """Write one picture."""

@@ -78,7 +78,6 @@ def run(options: Namespace) -> int:
 
     output = options.output
     runs = plan(options)
-    output.mkdir(parents=True, exist_ok=True)
     hold(output)
     try:
         if options.commands:
@@ -218,7 +217,6 @@ def prepare(run: Run) -> list[str]:
     """
     from nsvq_lightning.training.run_folder import RUN_FILES, hold, let_go
 
-    run.folder.mkdir(parents=True, exist_ok=True)
     hold(run.folder)
     try:
         begun, config = (run.folder / CHECKPOINT).is_file(), run.folder / "config.yaml"

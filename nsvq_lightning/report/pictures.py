@@ -158,7 +158,6 @@ def frame_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
         with video_writer(path, width, height, fps) as add:
             yield lambda picture: add(as_bytes(picture))
     else:
-        path.mkdir(parents=True, exist_ok=True)
         names = (path / f"{index:05d}.png" for index in count())
         yield lambda picture: write_png(next(names), picture)
         if (older := next(names)).exists():

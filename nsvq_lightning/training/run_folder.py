@@ -4,7 +4,6 @@ import atexit
 import os
 import platform
 from contextlib import suppress
-from functools import partial
 from itertools import count
 from pathlib import Path
 from weakref import WeakKeyDictionary
@@ -40,7 +39,7 @@ def run_folder(trainer: Trainer) -> Path:
     """
     folder = _FOLDERS.get(trainer)
     if folder is None:
-        folder = _FOLDERS[trainer] = on_first_process(trainer, partial(_choose, trainer))
+        folder = _FOLDERS[trainer] = on_first_process(trainer, lambda: _choose(trainer))
     return folder
 
 
@@ -81,7 +80,7 @@ def claim_version(parent: Path) -> Path:
 
 
 def take(folder: Path, checkpoint: StrPath | None) -> None:
-    """Create the folder if needed and hold it; set aside the log of the run in it, before a CSV logger removes it.
+    """Hold the folder; set aside the log of the run in it, before a CSV logger removes it.
 
     Args:
         folder: Folder that was given for a run.
@@ -91,7 +90,6 @@ def take(folder: Path, checkpoint: StrPath | None) -> None:
         FileExistsError: It holds a run, and the checkpoint is not in it; or another process writes to it.
     """
     _refuse_other_run(folder, checkpoint)
-    folder.mkdir(parents=True, exist_ok=True)
     hold(folder)
     _refuse_other_run(folder, checkpoint)  # one that has come and gone in between
     log_file = folder / "metrics.csv"  # of Lightning's CSV logger, which removes an existing one
@@ -100,7 +98,7 @@ def take(folder: Path, checkpoint: StrPath | None) -> None:
 
 
 def hold(folder: Path) -> None:
-    """Keep other processes from writing a run to a folder until :func:`let_go`, or until this process ends, however.
+    """Make a folder and keep other processes from writing a run there until :func:`let_go`, or this one ends, however.
 
     The system unlocks what a process has locked when that ends: what a killed run has left is an unlocked file, and
     temporary files, which are removed.
@@ -110,6 +108,7 @@ def hold(folder: Path) -> None:
     """
     if folder.resolve() in _HELD:
         return
+    folder.mkdir(parents=True, exist_ok=True)
     marker = folder / MARKER
     owner = marker.read_text(encoding="utf-8", errors="replace") if marker.is_file() else ""
     lock = FileLock(folder / LOCK, blocking=False, thread_local=False)
