@@ -223,14 +223,6 @@ def _way(neighbour, path, left):  # type: ignore[no-untyped-def]
     return 1 + ((neighbour >> left) & 1) if neighbour >> (left + 1) == path else 0
 
 
-@inline
-def _contexts_of(first, second, path, left, bits, two):  # type: ignore[no-untyped-def]
-    """The node where a decision is taken, with the branches of the two neighbours there, and, with ``two``, alone."""
-    node = (int64(1) << (bits - 1 - left)) + path
-    context = _RELATIONS * node + 3 * _way(first, path, left) + _way(second, path, left)
-    return context, (_RELATIONS << min(bits, _MODELLED_BITS)) + node if two else context
-
-
 @_stream_kernel
 def _code_paths(paths, bits, neighbours, words, contexts, two, reads):  # type: ignore[no-untyped-def]
     state = rc.start(words, reads)
@@ -239,7 +231,10 @@ def _code_paths(paths, bits, neighbours, words, contexts, two, reads):  # type: 
         first, second = _path_of(paths, neighbours[i, 0]), _path_of(paths, neighbours[i, 1])
         path = int64(0)
         for left in range(bits - 1, plain - 1, -1):
-            context, quick = _contexts_of(first, second, path, left, bits, two)
+            # The node where the decision is taken, with the branches of the two neighbours there, and alone.
+            node = (int64(1) << (bits - 1 - left)) + path
+            context = _RELATIONS * node + 3 * _way(first, path, left) + _way(second, path, left)
+            quick = (_RELATIONS << min(bits, _MODELLED_BITS)) + node if two else context
             bit = (paths[i] >> left) & 1
             bit, state = rc.code_bit(bit, context, quick, contexts, state, words, reads)
             path = 2 * path + bit

@@ -35,11 +35,6 @@ def new_contexts(count: int, met: int = 0) -> Uint32s:
     return np.full(count, (1 << 23) + met, np.uint32)
 
 
-@inline
-def _chance(context, quick, contexts):
-    return ((contexts[context] >> uint32(8)) + uint64(contexts[quick] >> uint32(8))) >> uint64(1)
-
-
 _RATES = np.rint(65536 / (np.arange(COUNT_LIMIT + 1) + 1.6)).astype(np.int64)
 # No probability is below 48/65536: an unlikely bit costs at most 11 bits.
 _MIN_CHANCE = 48
@@ -53,13 +48,6 @@ def _learn(bit, context, contexts, limit):
     target = _MIN_CHANCE + int64(bit) * (65536 - 2 * _MIN_CHANCE)
     chance += ((target - chance) * _RATES[n]) >> 16
     contexts[context] = uint32((chance << 8) + n + (n < limit))
-
-
-@inline
-def _learn_both(bit, context, quick, contexts):
-    _learn(bit, context, contexts, COUNT_LIMIT if context == quick else SLOW_LIMIT)
-    if context != quick:
-        _learn(bit, quick, contexts, QUICK_LIMIT)
 
 
 @inline
@@ -111,12 +99,15 @@ def _narrowed(low, step, width, used, words, reads):
 def code_bit(bit, context, quick, contexts, state, words, reads):
     """Write a bit, or read one, of two contexts or of the same one twice; returns it and the new state."""
     low, width, used = state
-    part = (width >> uint64(16)) * _chance(context, quick, contexts)
+    chance = ((contexts[context] >> uint32(8)) + uint64(contexts[quick] >> uint32(8))) >> uint64(1)
+    part = (width >> uint64(16)) * chance
     if reads is not None:
         bit = int64(low < part)
     one = uint64(0) - uint64(bit)  # all bits set for 1, none for 0
     width = (part & one) | ((width - part) & ~one)
-    _learn_both(bit, context, quick, contexts)
+    _learn(bit, context, contexts, COUNT_LIMIT if context == quick else SLOW_LIMIT)
+    if context != quick:
+        _learn(bit, quick, contexts, QUICK_LIMIT)
     return bit, _narrowed(low, part & ~one, width, used, words, reads)
 
 
