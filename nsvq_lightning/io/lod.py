@@ -10,13 +10,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from hashlib import sha256
-from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from shutil import rmtree
 
 import numpy as np
 
-from nsvq_lightning.io.atomic import StrPath, make_folder_of, write_bytes, write_text
+from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, Json, as_defect, naming_file
 from nsvq_lightning.io.sog import META, PALETTE_LIMIT, read_sog, sog_contents
@@ -30,7 +29,7 @@ _ASSET = {"generator": "nsvq-lightning"}
 
 
 def write_lod(
-    path: StrPath, scene: CompressedScene, *, coarser: Sequence[CompressedScene] = (), palette: int = PALETTE_LIMIT
+    path: Path, scene: CompressedScene, *, coarser: Sequence[CompressedScene] = (), palette: int = PALETTE_LIMIT
 ) -> int:
     """Write a scene as streamed SOG: ``lod-meta.json`` and, beside it, the folders that it names.
 
@@ -51,15 +50,14 @@ def write_lod(
     """
     coarse = [CompressedScene.from_splats(level).finite() for level in coarser]
     levels = [scene, *(level.relative_to(scene.origin) if any(level.origin) else level for level in coarse)]
-    target = Path(path)
     counts = [len(level) for level in levels]
-    if any(a <= b for a, b in pairwise(counts)):
+    if counts != sorted({*counts}, reverse=True):
         raise ValueError(f"each level must have fewer splats than the one before it, got {counts}")
     tree, leaves = _tree(levels)
     old = []
     with suppress(FileNotFoundError, FormatError):
-        old = _index(target)["own"]
-    make_folder_of(target)
+        old = _index(path)["own"]
+    make_folder_of(path)
     folders: list[str] = []
     total = 0
     for number, splats in enumerate(levels):
@@ -67,10 +65,10 @@ def write_lod(
             contents = sog_contents(splats.take(np.concatenate([rows for rows, _ in runs])), palette)
             # Those of two indices in one folder differ.
             digest = sha256(b"".join(contents.values())).hexdigest()[:8]
-            folder = f"{target.name[: -len(NAME)]}{number}_{part}_{digest}"
-            (target.parent / folder).mkdir(exist_ok=True)
+            folder = f"{path.name[: -len(NAME)]}{number}_{part}_{digest}"
+            (path.parent / folder).mkdir(exist_ok=True)
             for name, data in contents.items():
-                total += write_bytes(target.parent / folder / name, data)
+                total += write_bytes(path.parent / folder / name, data)
             offset = 0
             for rows, node in runs:
                 node["lods"][str(number)] = {"file": len(folders), "offset": offset, "count": len(rows)}
@@ -85,9 +83,9 @@ def write_lod(
         "filenames": [f"{folder}/{META}" for folder in folders],
         "tree": tree,
     }
-    total += write_text(target, json.dumps(about, separators=(",", ":")))
+    total += write_text(path, json.dumps(about, separators=(",", ":")))
     for folder in {name.partition("/")[0] for name in old if name.count("/") == 1}.difference(folders):
-        rmtree(target.parent / folder, ignore_errors=True)
+        rmtree(path.parent / folder, ignore_errors=True)
     return total
 
 
@@ -188,14 +186,13 @@ def _is_beside(name: PurePosixPath) -> bool:
     return not name.is_absolute() and ".." not in name.parts and (name.name == META or name.suffix == ".sog")
 
 
-def read_lod(path: StrPath) -> CompressedScene:
+def read_lod(path: Path) -> CompressedScene:
     """Read the finest level of a streamed SOG, and its environment.
 
     Raises:
         FormatError: A file is truncated, altered or of another version.
         OSError: A file cannot be read.
     """
-    path = Path(path)
     parts = [read_sog(path.parent / name) for name in _index(path)["shown"]]
     size = path.stat().st_size + sum(part.stored_bytes or 0 for part in parts)
     # The surroundings may be of another kind; splats are shown as one.

@@ -5,7 +5,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -51,8 +51,8 @@ _CHUNK = 256
 # Rows converted at a time, about 1 MB: they fit the cache and keep memory at one copy of the scene.
 _ROWS = 1 << 12
 _RGB = ["red", "green", "blue"]
-# The normals of points, which other programs expect, are 0 unless an attribute is called so.
-_UNUSED = [] if any("nx" in attribute.ply.split() for attribute in ATTRIBUTES.values()) else ["nx", "ny", "nz"]
+# The normals of points, which other programs expect, are 0.
+_UNUSED = ["nx", "ny", "nz"]
 # Order of the columns.
 _ORDER = tuple(dict.fromkeys(("means", "unused", "sh0", "shN", "opacities", "scales", "quats", *ATTRIBUTES)))
 
@@ -307,7 +307,7 @@ def _near(means: Arrays) -> tuple[Arrays, Place]:
 def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, Arrays]:
     """Rows ``[N, D]`` of each attribute."""
     columns = _needed(header, sh_degree)
-    needed = [*chain(*columns.values())]
+    needed = [name for names in columns.values() for name in names]
     known = {*needed, *_UNUSED, *_RGB, "alpha", "filter_3D"}
     if others := [name for name in header.properties if name not in known]:
         shown = " ".join(others[:5])

@@ -66,7 +66,7 @@ def write_usda(path: StrPath, scene: CompressedScene) -> int:
         return file.tell()
 
 
-def read_usda(path: StrPath) -> CompressedScene:
+def read_usda(path: Path) -> CompressedScene:
     """Read the splats of a ``.usda`` file with one prim of splats, without transforms.
 
     Attributes may be half as precise (``positionsh``), or samples in time, of which the first is read. A stage with z
@@ -75,7 +75,7 @@ def read_usda(path: StrPath) -> CompressedScene:
     Raises:
         FormatError: It is truncated, damaged or something else.
     """
-    data = Path(path).read_bytes()
+    data = path.read_bytes()
     with naming_file(path):
         if data.startswith((b"PXR-USDC", b"PK")):
             raise FormatError("binary OpenUSD (.usdc or .usdz); only text is read", BINARY_REMEDY)

@@ -2,8 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import reduce
-from operator import and_
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -99,17 +97,20 @@ def finite_rows(attributes: Mapping[str, _Array]) -> tuple[_Array, dict[str, int
     Returns:
         A boolean mask ``[N]`` and, for each attribute with non-finite rows, how many it has.
     """
-    masks: dict[str, Any] = {}
+    kept: Any = True
+    culprits = {}
     for name, values in attributes.items():
         rows = values.reshape(len(values), math.prod(values.shape[1:]))
         if isinstance(rows, np.ndarray):
-            masks[name] = np.isfinite(rows).all(1)
+            mask: Any = np.isfinite(rows).all(1)
         else:  # torch makes a copy on the way
             import torch
 
-            masks[name] = torch.cat([part.isfinite().all(1) for part in rows.split(ROWS)])
-    culprits = {name: len(mask) - int(mask.sum()) for name, mask in masks.items() if not mask.all()}
-    return reduce(and_, masks.values()), culprits
+            mask = torch.cat([part.isfinite().all(1) for part in rows.split(ROWS)])
+        kept = kept & mask
+        if lost := len(mask) - int(mask.sum()):
+            culprits[name] = lost
+    return kept, culprits
 
 
 def listed(culprits: Mapping[str, int]) -> str:
