@@ -65,17 +65,9 @@ def sort_by_depth(parts, count, keys, ids, keys2, ids2, histogram):
 
 
 @inline
-def tile_index(x, y, group_columns):
-    """Number of a tile: tiles of one group are consecutive."""
-    inside = (1 << GROUP_SHIFT) - 1
-    group = (y >> GROUP_SHIFT) * group_columns + (x >> GROUP_SHIFT)
-    return group * GROUP_TILES + ((y & inside) << GROUP_SHIFT) + (x & inside)
-
-
-@inline
 def _visit_tiles(part, parts, count, order, boxes, group_columns, histogram, ids, entries):
     """Count the splats of every tile; or write their rows (``ids``, by place) into its list, keeping the order."""
-    row = histogram[part]
+    row, inside = histogram[part], (1 << GROUP_SHIFT) - 1
     if entries is None:
         row[:] = 0
     first, end = share(count, part, parts)
@@ -91,7 +83,9 @@ def _visit_tiles(part, parts, count, order, boxes, group_columns, histogram, ids
         splat_row = None if entries is None else get(ids, place)
         for y in range(y0, y0 + rows):
             for x in range(x0, x0 + columns):
-                tile = tile_index(x, y, group_columns)
+                # Tiles of one group are consecutive.
+                group = (y >> GROUP_SHIFT) * group_columns + (x >> GROUP_SHIFT)
+                tile = group * GROUP_TILES + ((y & inside) << GROUP_SHIFT) + (x & inside)
                 entry = get(row, tile)
                 put(row, tile, entry + 1)
                 if entries is not None:
