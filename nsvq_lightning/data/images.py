@@ -4,7 +4,6 @@ import struct
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
 from pathlib import Path
@@ -271,8 +270,7 @@ class Picture(NamedTuple):
         return sum(each.nbytes for each in self if each is not None)
 
 
-@dataclass(frozen=True, eq=False)
-class ImageSource:
+class ImageSource(NamedTuple):
     """How the picture of one view is made from its file.
 
     Pixels count if the mask says so, if they are not transparent and if the camera saw them; each pixel of the picture

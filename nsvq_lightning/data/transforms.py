@@ -6,9 +6,9 @@ The file has the cameras; the points to start from are those of a ``.ply`` file,
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -106,8 +106,7 @@ _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"
 _OTHER_LENSES = ("latlong", "equirectangular", "orthographic", "ftheta_p1")
 
 
-@dataclass(frozen=True, eq=False)
-class _Frame:
+class _Frame(NamedTuple):
     """A frame of a transforms file; its own values come before those of the file."""
 
     file: Path
@@ -304,7 +303,7 @@ def _frames(file: Path, allow_outside: bool) -> tuple[Json, dict[str, _Frame]]:
     masks = locate(masked, file.parent, str(file), allow_outside, photos.values())
     frames = {}
     for frame in given:
-        frame = replace(frame, photo=photos[frame.path("file_path")], mask=masks.get(frame.path("mask_path")))
+        frame = frame._replace(photo=photos[frame.path("file_path")], mask=masks.get(frame.path("mask_path")))
         if frame.name in frames:
             raise frame.error(f"is of {frame.name}, which an earlier frame is of, too", "remove one of them")
         frames[frame.name] = frame

@@ -5,8 +5,8 @@ extent is 5, as it is in most scenes of COLMAP: learning rates, first sizes and 
 """
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,8 +27,7 @@ STEPS = 2.0**18
 REACH = 2.0
 
 
-@dataclass(frozen=True)
-class Frame:
+class Frame(NamedTuple):
     """Coordinates of a scene; x is at ``middle + unit · x`` in its files.
 
     Attributes:

@@ -11,7 +11,6 @@ import math
 import struct
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_type_hints
@@ -81,8 +80,7 @@ class StreamEntry(NamedTuple):
 _DIGEST_END = 24
 
 
-@dataclass(frozen=True)
-class Header:
+class Header(NamedTuple):
     """All that a ``.nsvq`` file says about its streams.
 
     Attributes:
@@ -104,8 +102,8 @@ class Header:
     origin: Place
     attributes: tuple[AttributeEntry, ...]
     streams: tuple[StreamEntry, ...]
-    config: Json = field(default_factory=dict)
-    metrics: dict[str, float | None] = field(default_factory=dict)
+    config: Json
+    metrics: dict[str, float | None]
     cameras: _Cameras = ()
     version: int = VERSIONS[-1]
 
@@ -159,12 +157,12 @@ class Header:
             ValueError: ``config`` holds something that is not a JSON value (tensor, object, NaN).
         """
         try:
-            table = asdict(self)
+            table = self._asdict()
             del table["version"]
             if not self.cameras:
                 del table["cameras"]
-            for name, value in self.metrics.items():
-                table["metrics"][name] = None if value is None or not math.isfinite(value) else value
+            finite = {name: value for name, value in self.metrics.items() if value is not None and math.isfinite(value)}
+            table["metrics"] = dict.fromkeys(self.metrics) | finite
             text = json.dumps(table, sort_keys=True, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
             return text.encode()
         except (TypeError, ValueError, RecursionError) as error:
@@ -266,7 +264,7 @@ def unframe(data: bytes) -> tuple[Header, dict[str, memoryview]]:
     start = _PREFIX.size + json_bytes
     if start > len(data):
         raise FormatError(f"damaged: a header of {json_bytes} bytes in a file of {len(data)}")
-    header = replace(Header.from_json(data[_PREFIX.size : start]), version=version)
+    header = Header.from_json(data[_PREFIX.size : start])._replace(version=version)
     payload = memoryview(data)[start:]
     streams = {}
     end = 0
