@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Annotated
 
 import torch
@@ -74,7 +73,7 @@ class SplatBudget(SplatCallback):
         elif self.splats is None:
             advice = "give a number of splats (--splats) or bytes (--bytes)"
             scene = run_scene.needed_scene(trainer, "a budget from the photos needs them", advice)
-            detail = distributed.on_first_process(trainer, partial(detailed_pixels, scene))
+            detail = distributed.on_first_process(trainer, lambda: detailed_pixels(scene))
             far = stretch(scene)
             budget = splats_for_photos(len(scene.train), detail, far * self.quality)
             shown = f"{len(scene.train)} photos with {detail:,.0f} detailed pixels each support"

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from lightning.pytorch import Callback
 from torch import Tensor
-from torch.nn import Parameter
 
 from nsvq_lightning import callbacks as cb
 from nsvq_lightning.callbacks.forecast import iteration_seconds
@@ -396,7 +395,7 @@ class Compressor:
         # Where none go, harmonics of the splats themselves need no training beside their codes: ±0.006 dB on fox and
         # bonsai, and without their moments a million splats take 1 GB less. Where some go, it is worth 0.06 dB.
         if "shN" in sizes and not prune:
-            module.splats.shN = Parameter(self._splats.shN, requires_grad=False)
+            module.splats.shN = torch.nn.Parameter(self._splats.shN, requires_grad=False)
         if sizes or prune or not self._is_own:  # its own pictures teach nothing new
             phases = cb.PhaseSchedule(
                 total=steps,
