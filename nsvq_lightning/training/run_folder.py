@@ -182,7 +182,5 @@ def _choose(trainer: Trainer) -> Path:
         root = getattr(getattr(trainer, "datamodule", None), "root", None)
         scene = (root is not None and Path(root).resolve().name) or "scene"
         folder = claim_version(Path(trainer.default_root_dir) / scene)
-        hold(folder)
-        return folder
     take(folder, trainer.ckpt_path if trainer.state.fn == "fit" else None)
     return folder
