@@ -1,7 +1,6 @@
 """What callbacks share: the check of the module, acting once per step, the folder of the run, the search for NaN."""
 
 from dataclasses import dataclass, field
-from inspect import get_annotations
 from pathlib import Path
 from typing import Any, ClassVar, dataclass_transform
 
@@ -22,7 +21,7 @@ from .settings import check_settings
 def _with_settings(cls: type["SplatCallback"], /, **options: bool) -> None:
     """Make a subclass a dataclass, if it has settings of its own."""
     super(SplatCallback, cls).__init_subclass__()
-    if options or get_annotations(cls):
+    if options or {"__annotations__", "__annotate_func__"} & vars(cls).keys():  # whose names may be unknown yet
         dataclass(eq=False, **options)(cls)
 
 

@@ -82,11 +82,11 @@ def kernel_folder() -> Path | None:
 @cache
 def _writable(chosen: str) -> Path | None:
     own = Path(chosen, "nsvq_lightning") if chosen else Path(AppDirs("nsvq_lightning", appauthor=False).user_cache_dir)
-    folder = own / f"kernels-numba-{numba.__version__}"
     try:
+        folder = own.expanduser() / f"kernels-numba-{numba.__version__}"
         folder.mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=folder).close()
-    except OSError:
+    except (OSError, RuntimeError):  # there is no home
         return None
     return folder
 

@@ -11,6 +11,7 @@ import pytest
 from numba.core.caching import FunctionCache
 
 from nsvq_lightning.compute import kernel_cache
+from nsvq_lightning.compute import kernel_cache
 from nsvq_lightning.compute.kernel_cache import kernel_folder, source_digest
 
 SOURCES = {
@@ -156,6 +157,21 @@ def test_without_a_folder_they_are_compiled_in_each_process(
         kernel = write().total
         assert kernel(np.ones(4)) == 12.0
         assert not kernel.stats.cache_hits
+
+
+def test_without_a_home_there_is_no_folder_of_that_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """As in a container whose user is not in /etc/passwd."""
+    pwd = pytest.importorskip("pwd", reason="Windows has another place for homes")
+
+    def nobody(_: int) -> None:
+        raise KeyError("uid not found")
+
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", nobody)
+    monkeypatch.chdir(tmp_path)
+    assert kernel_cache._writable.__wrapped__("") is None
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_kernel_works_where_its_folder_does_not(write: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
