@@ -16,6 +16,7 @@ from torch import Tensor
 
 from nsvq_lightning import callbacks as cb
 from nsvq_lightning.callbacks.forecast import iteration_seconds
+from nsvq_lightning.callbacks.pruning import VIEWS
 from nsvq_lightning.compression import viewpoints
 from nsvq_lightning.compression.basis import components
 from nsvq_lightning.compute.devices import best_device
@@ -27,6 +28,7 @@ from nsvq_lightning.io.morton import spatial_order
 from nsvq_lightning.io.nsvq.file import decode, encode
 from nsvq_lightning.io.nsvq.header import frame, unframe
 from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.random import generator, top_rows
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.sampling import trained_by
 from nsvq_lightning.report.numbers import evaluate
@@ -422,6 +424,17 @@ class Compressor:
         most = AT_ONCE * (1 if self._is_own else WITH_PHOTOS)
         return 1 << math.ceil(math.log2(len(self.scene) / AT_ONCE)) if len(self.scene) > most else 1
 
+    @cached_property
+    def _effects(self) -> Tensor:
+        """How much pictures of the whole are likely to change without each splat ``[N]``.
+
+        In those of a part alone, what shows through its splats is missing, so all of them seem to be needed.
+        """
+        splats, signs = importance.below_cap(self._splats), generator(self.seed, 0, "signs")
+        views = map(self.data.scene.view, spread(self.data.scene.train, VIEWS))
+        found = (importance.sensitivity(splats, each.camera, self._render, signs, each.mask)[0] for each in views)
+        return importance.likely_effects(splats, sum((each.opacities for each in found), torch.zeros(())))
+
     def _train_parts(self, setting: Setting) -> CompressedScene:
         """Train the parts of a large scene, one after another, each with codebooks of its own.
 
@@ -436,6 +449,8 @@ class Compressor:
             own = Compressor(part, cameras, None, self.storage, self.seed, self.minutes * len(part) / 1e6, self.steps)
             own.stopped, own.begun = self.stopped, bool(found)
             left = max(1, setting.splats * len(part) // len(self.scene))
+            if left < len(part):  # in its pictures are those that go, too
+                _, own._splats = own.data, own._splats.take(top_rows(self._effects[rows], left))
             try:
                 found.append(own._train(setting._replace(splats=left)))
             finally:

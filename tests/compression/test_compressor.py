@@ -18,13 +18,15 @@ from splat_scenes import ball
 import nsvq_lightning as nl
 from nsvq_lightning.callbacks.forecast import grown
 from nsvq_lightning.compression.compressor import SLACK, THINNEST, Compressor, Setting, setting_for
-from nsvq_lightning.compression.viewpoints import MEASURED, Measure, own_scene, pictures
+from nsvq_lightning.compression.viewpoints import MEASURED, Measure, look_at, own_scene, pictures
 from nsvq_lightning.data.images import ImageStore, Picture
 from nsvq_lightning.data.scene import Scene, load_scene
 from nsvq_lightning.io import CompressedScene
 from nsvq_lightning.io.nsvq.file import decode
 from nsvq_lightning.io.nsvq.header import unframe
 from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.random import generator
+from nsvq_lightning.splats.splats import RawSplats
 
 ORIGIN = (500_000.0, 4.5e6, 30.0)
 LIMITS = "0.5k", "16k"
@@ -378,6 +380,29 @@ def test_a_large_scene_is_trained_in_parts(monkeypatch: pytest.MonkeyPatch) -> N
     # Of too many splats for that, each part has its own pictures, and is as small as without photos.
     monkeypatch.setattr("nsvq_lightning.compression.compressor.WITH_PHOTOS", 2)
     assert Compressor(scene, (), photos).parts == 4
+
+
+def test_parts_keep_what_pictures_of_the_whole_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the splats that are behind a wall, which is another part, are seen by nobody."""
+    monkeypatch.setattr("nsvq_lightning.compression.compressor.AT_ONCE", 300)
+    draws, identity = generator(0), torch.tensor([1.0, 0, 0, 0])
+
+    def drawn(count: int, width: float, depth: float, opacity: float, size: float) -> RawSplats:
+        means = torch.rand(count, 3, generator=draws) * torch.tensor([width, 2, 0.05]) + torch.tensor([-1, -1, depth])
+        scales, opacities = torch.full((count, 3), math.log(size)), torch.full((count,), opacity)
+        colors = torch.rand(count, 1, 3, generator=draws) - 0.5
+        return RawSplats(means, identity.repeat(count, 1), scales, opacities, colors, torch.zeros(count, 0, 3))
+
+    wall, behind = drawn(150, 1, 0, 6, 0.15), drawn(450, 2, 1, 2, 0.05)
+    scene = CompressedScene.from_splats(RawSplats(*(torch.cat(pair) for pair in zip(wall, behind, strict=True))))
+    places = [np.array([x, y, -6]) for x in (-0.2, 0, 0.2) for y in (-0.2, 0, 0.2)]
+    cameras = [look_at(np.array([0, 0, 0.5]), place, 80, 60, math.radians(30)) for place in places]
+    whole = Compressor(scene, cameras, steps=4)
+    assert whole.parts == 2
+    means = whole.at(Setting(300, "none")).scene.means
+    left = means[means[:, 2] > 0.5, 0]
+    assert (left > 0.25).sum() > 120
+    assert (left < -0.25).sum() < 5
 
 
 def test_steps_are_limited_by_the_time_that_those_of_the_whole_take(monkeypatch: pytest.MonkeyPatch) -> None:
