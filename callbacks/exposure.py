@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from lightning.pytorch import Trainer
 
-from nsvq_lightning.data.scene import View
+from nsvq_lightning.data.scene import View, exposures
 from nsvq_lightning.rendering.rasterize import Render
 from nsvq_lightning.top_level import log
 from nsvq_lightning.training import distributed, run_scene
@@ -39,7 +39,7 @@ class ExposureCompensation(SplatCallback):
     _plain: LossTerm | None = field(default=None, init=False)
 
     def on_train_start(self, trainer: Trainer, module: SplatModule) -> None:
-        """Start from no change, or from what a checkpoint has.
+        """Start from the brightness of SfM's points in each photo, or from what a checkpoint has.
 
         Raises:
             ValueError: The trainer has no data module with a scene, or the checkpoint is of another number of photos.
@@ -47,7 +47,7 @@ class ExposureCompensation(SplatCallback):
         need = "exposures are those of the train photos"
         scene = run_scene.needed_scene(trainer, need, "leave out ExposureCompensation")
         self._row = {view: row for row, view in enumerate(scene.train)}
-        start = torch.zeros(len(scene.train), 3, 4)
+        start = torch.nn.functional.pad(torch.diag_embed(exposures(scene) - 1), (0, 1))
         if self._loaded:
             start = self._loaded["changes"].clone()
             if len(start) != len(scene.train):

@@ -312,7 +312,7 @@ def check_scene(root: Path, model: "ColmapModel") -> Findings:
 def check_photos(scene: "Scene", model: "ColmapModel") -> Findings:
     """Decode all photos, in parallel: whether that works, how much masks exclude, and which are not in the model."""
     from nsvq_lightning.data.photo_files import photos_below
-    from nsvq_lightning.data.scene import ELSEWHERE, each_photo, is_elsewhere
+    from nsvq_lightning.data.scene import ELSEWHERE, each_photo, is_elsewhere, uneven
 
     # Share of the pixels that count, or what is wrong.
     found = each_photo(scene, lambda photo: 1.0 if photo.mask is None else float(photo.mask.float().mean()))
@@ -325,6 +325,8 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Findings:
         yield Finding("good", "photos", f"all {count} registered photos can be read")
         if is_elsewhere(scene):
             yield Finding("problem", "points", f"they {ELSEWHERE}")
+        elif remark := uneven(scene):
+            yield Finding("note", "exposures", f"photos {remark}")
     if masked := {name: share for name, share in shares.items() if share < 1}:
         left_out = 1 - sum(masked.values()) / len(masked)
         text = f"{len(masked)} of {count} photos have pixels that do not count, {100 * left_out:.0f} % of them"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ from lightning.pytorch import Callback, Trainer
 
 from nsvq_lightning.callbacks import ExposureCompensation, PhaseSchedule
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.data.scene import View
+from nsvq_lightning.data.scene import View, exposures, load_scene, uneven
 from nsvq_lightning.quality.metrics import color_corrected, psnr
 from nsvq_lightning.training import distributed
 from nsvq_lightning.training.module import SplatModule
@@ -67,6 +68,24 @@ def test_exposures_are_found(uneven_scene: Path, tmp_path: Path, caplog: pytest.
     assert "exposures of the train photos: " in caplog.text
     term: Any = module.loss_terms["photometric"]
     assert (list(module.loss_terms), term.args) == (["photometric"], (module,))  # not that with exposures
+
+
+def test_points_tell_exposures_of_photos(
+    uneven_scene: Path, demo_scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = load_scene(uneven_scene)
+    found = exposures(scene)
+    assert found.shape == (7, 3)
+    assert float(torch.corrcoef(torch.stack([found.mean(1).log2(), torch.tensor(STOPS[1:8])]))[0, 1]) > 0.9
+    assert re.fullmatch("differ in brightness by [12][0-9] %: .*ExposureCompensation evens that out", uneven(scene))
+    assert uneven(load_scene(demo_scene)) == ""
+    random = load_scene(demo_scene).with_random_points()
+    assert torch.equal(exposures(random), torch.ones(7, 3))
+    compensation = ExposureCompensation()
+    fit(uneven_scene, tmp_path, [compensation], 1)
+    assert f"the photos of {uneven_scene} differ in brightness" in caplog.text
+    start = compensation.state_dict()["changes"][:, :, :3].diagonal(dim1=1, dim2=2) + 1
+    torch.testing.assert_close(start, found, atol=0.01, rtol=0)
 
 
 def test_a_resumed_run_has_the_same_bits(uneven_scene: Path, tmp_path: Path) -> None:
