@@ -11,7 +11,6 @@ import pytest
 from numba.core.caching import FunctionCache
 
 from nsvq_lightning.compute import kernel_cache
-from nsvq_lightning.compute import kernel_cache
 from nsvq_lightning.compute.kernel_cache import kernel_folder, source_digest
 
 SOURCES = {
