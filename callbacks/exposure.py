@@ -85,6 +85,7 @@ class ExposureCompensation(SplatCallback):
         """Say how much the photos differ."""
         self.on_exception(trainer, module)
         gains = 1 + self._changes.detach()[:, :, :3].diagonal(dim1=1, dim2=2).mean(1)
+        gains = gains.clamp_min(1e-3)  # of a black photo
         stops = gains.log2() - gains.log2().mean()
         log.info(f"exposures of the train photos: {stops.min():+.2f} to {stops.max():+.2f} stops")
 

@@ -306,6 +306,7 @@ def check_scene(root: Path, model: "ColmapModel") -> Findings:
     if others := sum(is_cut(source.size, (camera.width, camera.height)) for camera, source in pairs):
         yield Finding("problem", "sizes", f"{others} of {len(scene)} files {OTHER_SHAPE}")
     yield from attempt("photos", check_photos(scene, model))
+    yield from attempt("still", check_still(scene))
     yield from attempt("run time", check_budget(scene))
 
 
@@ -341,6 +342,21 @@ def check_photos(scene: "Scene", model: "ColmapModel") -> Findings:
         text = f"{len(extra)} of {len(files)} files in {folder} are not in the model"
         advice = "they are not used; if many, photos lack overlap or sharpness"
         yield Finding("note", "registered", f"{text}: {advice}")
+
+
+def check_still(scene: "Scene") -> Findings:
+    """Whether pixels are the same in most photos: bars, or the background of a turntable."""
+    from nsvq_lightning.data.scene import spread
+
+    photos = [scene.images[index] for index in spread(scene.train, 32)]
+    plain = [image[::4, ::4] for image, mask in photos if mask is None and image.shape == photos[0].image.shape]
+    if len(plain) < 5 or scene.white:
+        return
+    shown = np.stack(plain).astype(np.float32)
+    share = (np.median(abs(shown - np.median(shown, 0)), 0) < 0.03 * shown.std()).mean()
+    if share > 0.03:
+        text = f"{100 * share:.0f} % of the pixels are the same in most photos"
+        yield Finding("note", "still", f"{text}, as bars and the background of a turntable are: mask them")
 
 
 def check_budget(scene: "Scene") -> Findings:

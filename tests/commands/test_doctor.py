@@ -208,6 +208,17 @@ def test_masks_that_exclude_most_are_noted(scene: Path) -> None:
     assert finding.text.startswith("2 of 9 photos have pixels that do not count, 97 % of them: most in view_001.png")
 
 
+def test_pixels_that_stand_still_are_noted(scene: Path) -> None:
+    """As bars of films and the background of a turntable."""
+    for path in (scene / "images").iterdir():
+        photo = cv2.imread(str(path))
+        photo[:12] = 0
+        assert cv2.imwrite(str(path), photo)
+    finding = _by_subject(scene)["still"]
+    assert finding.verdict == "note"
+    assert finding.text.startswith("17 % of the pixels are the same in most photos")
+
+
 def test_a_larger_model_beside_the_first_is_a_problem(scene: Path) -> None:
     shutil.copytree(scene / "sparse/0", scene / "sparse/1")
     images = scene / "sparse/0/images.bin"
