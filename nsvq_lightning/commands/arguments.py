@@ -266,8 +266,8 @@ def scene_with_views(
         said = f"those of {len(trained)} cameras, {trained[0].width} pixels wide, that it was trained by"
         log.info(f"{path}: blur and size are {said}")
         scene = replace(scene, cameras=trained_by(trained))
-    arguments = map(arguments_of, folders_beside(path))
-    if (photos and photos.white) or any("white_background=True" in given for given in arguments):
+    arguments = "".join(map(arguments_of, folders_beside(path)))
+    if (photos and photos.white) or re.search(r"white_background=True|\n  background: white\n", arguments):
         scene = on_white(scene)
     return scene, cameras, photos
 

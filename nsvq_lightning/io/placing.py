@@ -60,7 +60,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     from nsvq_lightning.rendering.frame import middle_of
     from nsvq_lightning.rendering.sh import sh_rotation
 
-    linear, shift = matrix[:3, :3], matrix[:3, 3]
+    linear, shift = matrix[:3, :3], matrix[:3, 3] + matrix[:3, :3] @ scene.origin
     size = np.cbrt(np.linalg.det(linear))
     if not (
         np.isfinite(matrix).all()
@@ -70,10 +70,9 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
         raise ValueError(f"{linear.tolist()} is no scaled rotation: splats can be turned and scaled evenly only")
     rotation = linear / size
     harmonics = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
-    means, origin = scene.means @ linear.T, linear @ scene.origin
-    if any(scene.origin) or (len(means) and np.linalg.norm(shift) > FAR * middle_of(means)[1] > 0):
-        origin += shift  # which moves, then, and not what is relative to it
-        shift = np.zeros(3)
+    means, origin = scene.means @ linear.T, np.zeros(3)
+    if len(means) and np.linalg.norm(shift) > FAR * middle_of(means)[1] > 0:
+        origin, shift = shift, origin  # which moves, then, and not what is relative to it
     cameras = scene.cameras.copy()
     cameras[:, :3] = cameras[:, :3] @ linear.T + shift
     return scene.changed(

@@ -377,7 +377,7 @@ def read_spz(path: Path) -> CompressedScene:
         for name, size in header.sizes.items()
     }
     if not header.system:
-        advice = "If it is upside down: nsvq convert --up minus-y --up-from 0 1 0"
+        advice = "If it is upside down: nsvq convert IN.spz OUT --up minus-y --up-from 0 1 0"
         log.info(f"{path}: the file does not say where its axes point; taken as right, down, front. {advice}")
     degree = min(header.sh_degree, 3)
     if header.sh_degree > degree:

@@ -215,9 +215,9 @@ def read_cameras(path: Path) -> dict[str, Camera]:
 
 
 def arguments_of(folder: Path) -> str:
-    """What INRIA's trainer, whose folder it is, was called with; nothing in another folder."""
-    path = folder / "cfg_args"
-    return path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    """What INRIA's trainer or this one, whose folder it is, was called with; nothing in another folder."""
+    paths = [path for name in ("cfg_args", "config.yaml") if (path := folder / name).is_file()]
+    return paths[0].read_text(encoding="utf-8", errors="replace") if paths else ""
 
 
 def _times_smaller(arguments: str, width: int) -> float:

@@ -140,6 +140,13 @@ def test_what_inrias_trainer_saw_in_front_of_white_is_white(tmp_path: Path) -> N
         assert trained_scene(scene, None).background == (float(white),) * 3
 
 
+def test_splats_of_a_run_are_shown_in_front_of_what_it_says(tmp_path: Path) -> None:
+    save(random_splats(9), tmp_path / "scene.ply")
+    for color, shown in (("white", 1.0), ("black", 0.0)):
+        (tmp_path / "config.yaml").write_text(f"model:\n  sh_degree: 3\n  background: {color}\ndata: {{}}\n")
+        assert trained_scene(tmp_path / "scene.ply", None).background == (shown,) * 3
+
+
 def test_a_page_of_guessed_cameras_is_no_source_of_cameras(tmp_path: Path) -> None:
     save(random_splats(30), tmp_path / "scene.ply")
     assert main(["view", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "viewer.html")]) == 0

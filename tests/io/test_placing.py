@@ -111,6 +111,19 @@ def test_a_drone_that_turns_above_the_ground_looks_down(up: list[float]) -> None
     np.testing.assert_allclose(up_of(cameras), up, atol=0.03)
 
 
+def test_a_scene_that_comes_near_has_no_origin_any_more() -> None:
+    """Files of other formats have none, so it would be displaced there."""
+    near = ball(50)
+    there = np.hstack([np.eye(3), [[4e6], [5e5], [-2e6]]])
+    far = moved(near, there)
+    assert far.origin == (4e6, 5e5, -2e6)
+    back = moved(far, np.hstack([np.eye(3), -there[:, 3:] + 1]))
+    assert back.origin == (0, 0, 0)
+    np.testing.assert_allclose(back.means, near.means + 1, atol=1e-5)
+    turned = moved(far, np.hstack([[[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.zeros((3, 1))]))
+    assert turned.origin == (-5e5, 4e6, -2e6)
+
+
 def test_nothing_is_moved_of_an_empty_scene() -> None:
     empty = ball(2).take(np.zeros(0, np.int64))
     assert len(moved(empty, np.c_[np.eye(3), np.ones(3)])) == 0
