@@ -89,7 +89,7 @@ def json_object(text: bytes, name: str) -> Json:
         FormatError: It holds something else.
     """
     with as_defect(f"damaged: {name} is not JSON"):
-        found = json.loads(text.decode("utf-8-sig"), parse_constant=_no_number)
+        found = json.loads(text.decode(), parse_constant=_no_number)
     if not isinstance(found, dict):
         raise FormatError(f"damaged: {name} is not a JSON object")
     return found

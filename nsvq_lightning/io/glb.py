@@ -110,7 +110,7 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
     return total
 
 
-def read_glb(path: Path) -> CompressedScene:
+def read_glb(path: StrPath) -> CompressedScene:
     """Read all splats of the scene of a ``.glb`` file, where its nodes put them.
 
     Raises:
@@ -119,7 +119,7 @@ def read_glb(path: Path) -> CompressedScene:
             Lengths that are logarithms, and the names of drafts of the extension, are.
     """
     with naming_file(path), as_defect("of a kind that is not read, or altered", remedy="save it as a plain .glb"):
-        document, data = _parsed(path.read_bytes())
+        document, data = _parsed(Path(path).read_bytes())
         parts, count = [], 0
         for primitive, matrix in _primitives(document):
             parts.append(moved(_splats(document, data, primitive), matrix))

@@ -15,7 +15,7 @@ from shutil import rmtree
 
 import numpy as np
 
-from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
+from nsvq_lightning.io.atomic import StrPath, make_folder_of, write_bytes, write_text
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, Json, as_defect, naming_file
 from nsvq_lightning.io.sog import META, PALETTE_LIMIT, read_sog, sog_contents
@@ -29,7 +29,7 @@ _ASSET = {"generator": "nsvq-lightning"}
 
 
 def write_lod(
-    path: Path, scene: CompressedScene, *, coarser: Sequence[CompressedScene] = (), palette: int = PALETTE_LIMIT
+    path: StrPath, scene: CompressedScene, *, coarser: Sequence[CompressedScene] = (), palette: int = PALETTE_LIMIT
 ) -> int:
     """Write a scene as streamed SOG: ``lod-meta.json`` and, beside it, the folders that it names.
 
@@ -48,6 +48,7 @@ def write_lod(
     Raises:
         ValueError: A level is not coarser than the one before it.
     """
+    path = Path(path)
     coarse = [CompressedScene.from_splats(level).finite() for level in coarser]
     levels = [scene, *(level.relative_to(scene.origin) if any(level.origin) else level for level in coarse)]
     counts = [len(level) for level in levels]
@@ -186,13 +187,14 @@ def _is_beside(name: PurePosixPath) -> bool:
     return not name.is_absolute() and ".." not in name.parts and (name.name == META or name.suffix == ".sog")
 
 
-def read_lod(path: Path) -> CompressedScene:
+def read_lod(path: StrPath) -> CompressedScene:
     """Read the finest level of a streamed SOG, and its environment.
 
     Raises:
         FormatError: A file is truncated, altered or of another version.
         OSError: A file cannot be read.
     """
+    path = Path(path)
     parts = [read_sog(path.parent / name) for name in _index(path)["shown"]]
     size = path.stat().st_size + sum(part.stored_bytes or 0 for part in parts)
     # The surroundings may be of another kind; splats are shown as one.

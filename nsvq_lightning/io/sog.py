@@ -24,6 +24,7 @@ import math
 import re
 import struct
 import zlib
+from codecs import BOM_UTF8
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
@@ -166,7 +167,7 @@ class _Archive:
         check_start(".sog", data, _ZIP)
         with as_defect("truncated: no valid zip archive", _BAD_ZIP):
             self._zip = ZipFile(BytesIO(data))
-        self.meta = json_object(self._bytes(META, 1 << 20), META)
+        self.meta = json_object(self._bytes(META, 1 << 20).removeprefix(BOM_UTF8), META)
         self.version = self.meta.get("version", 1)
         if self.version not in (1, 2):
             raise FormatError(f"version {str(self.version)[:40]} of the format; this release reads 1 and 2")
@@ -384,14 +385,14 @@ def _archived(path: Path) -> tuple[bytes, int]:
     return buffer.getvalue(), sum(file.stat().st_size for file in (path, *pictures.values()))
 
 
-def read_sog(path: Path) -> CompressedScene:
+def read_sog(path: StrPath) -> CompressedScene:
     """Read a ``.sog`` file or a ``meta.json`` in its folder; the palette becomes the codebook of the harmonics.
 
     Raises:
         FormatError: The file is truncated, altered, of another version, or not a ``.sog`` file.
     """
     with naming_file(path):
-        data, size = _archived(path)
+        data, size = _archived(Path(path))
         archive = _Archive(data)
         raw = {"quats": archive.quats(), "scales": archive.values("scales", archive.texels("scales")[:, :3])}
         raw["sh0"], opacities = archive.colors()

@@ -62,13 +62,13 @@ def _records(scene: CompressedScene, clamped: Clamped) -> Records:
     return records
 
 
-def read_splat(path: Path) -> CompressedScene:
+def read_splat(path: StrPath) -> CompressedScene:
     """Read a ``.splat`` file.
 
     Raises:
         FormatError: The file does not consist of whole splats.
     """
-    data = path.read_bytes()
+    data = Path(path).read_bytes()
     with naming_file(path):
         if len(data) % (each := _RECORD.itemsize):
             raise FormatError(f"truncated, or not a .splat file: {len(data)} bytes are not whole splats of {each}")

@@ -362,14 +362,14 @@ def _packed_quats(rows: Float32s) -> Uint32s:
     return packed
 
 
-def read_spz(path: Path) -> CompressedScene:
+def read_spz(path: StrPath) -> CompressedScene:
     """Read a ``.spz`` file of version 1 to 4, with any axes; other extensions are ignored.
 
     Raises:
         FormatError: The file is truncated, altered, of another version, or not a ``.spz`` file; or version 4 needs
             Zstandard, and it is not installed.
     """
-    data = path.read_bytes()
+    data = Path(path).read_bytes()
     with naming_file(path):
         header, contents = _unpack(data) if data.startswith(_MAGIC) else _unzip(data)
     arrays = {
