@@ -111,7 +111,6 @@ def _nsvq_file(options: Namespace) -> Iterator[Path]:
 
 def _cameras(options: Namespace, file: Path) -> "dict[str, Camera]":
     """Cameras of the photos, or guessed ones."""
-    from nsvq_lightning.compression.viewpoints import likely_cameras
     from nsvq_lightning.io.formats import read_scene
 
     scene = None if options.live else read_scene(file)
@@ -120,6 +119,8 @@ def _cameras(options: Namespace, file: Path) -> "dict[str, Camera]":
         return cameras
     if scene is None:
         raise ValueError(f"{options.scene} does not say where its photos are: name their folder with --data.root")
+    from nsvq_lightning.compression.viewpoints import likely_cameras
+
     sys.stderr.write("no photos: cameras are guessed from the scene (-y is up); --data.root names their folder\n")
     return {f"guess {index}": camera for index, camera in enumerate(likely_cameras(scene.decode(), 8), 1)}
 

@@ -15,11 +15,11 @@ from nsvq_lightning.io.morton import spatial_order
 from nsvq_lightning.quality.metrics import eight_bit
 from nsvq_lightning.rendering.camera import Camera, camera_of
 from nsvq_lightning.rendering.constants import NEAR
-from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
+from nsvq_lightning.rendering.frame import EXTENT, Frame
 from nsvq_lightning.rendering.poses import poses, view_towards
 from nsvq_lightning.rendering.rasterize import render
 from nsvq_lightning.rendering.sh import sh_basis
-from nsvq_lightning.splats.conventions import Float32s, Float64s
+from nsvq_lightning.splats.conventions import Float32s, Float64s, middle_of
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached, sh_degree_of
 from nsvq_lightning.training.importance import Renderer
 

@@ -28,8 +28,8 @@ from nsvq_lightning.data.transforms import read_poses
 from nsvq_lightning.data.undistortion import rectify
 from nsvq_lightning.io.atomic import StrPath
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.frame import EXTENT, Frame, middle_of
-from nsvq_lightning.splats.conventions import ZERO, Bools, Float32s, Float64s, Place
+from nsvq_lightning.rendering.frame import EXTENT, Frame
+from nsvq_lightning.splats.conventions import ZERO, Bools, Float32s, Float64s, Place, middle_of
 from nsvq_lightning.top_level import log
 
 T = TypeVar("T")

@@ -124,14 +124,14 @@ class CompressedScene:
             ValueError: The shape of an attribute does not fit the others, or one is missing.
             TypeError: ``splats`` is nothing of these, as a path.
         """
-        import torch
-
-        from nsvq_lightning.splats.splats import RawSplats, warn_if_trained
-
         if isinstance(splats, CompressedScene):
             return splats
         if hasattr(splats, "compressed"):
             return splats.compressed()  # type: ignore[no-any-return, operator, union-attr]  # a module
+        import torch
+
+        from nsvq_lightning.splats.splats import RawSplats, warn_if_trained
+
         warn_if_trained(splats)
         tensors = splats.state_dict() if isinstance(splats, torch.nn.Module) else splats
         named: Any = tensors._asdict() if isinstance(tensors, RawSplats) else tensors

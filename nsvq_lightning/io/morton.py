@@ -7,7 +7,7 @@ import numpy as np
 from nsvq_lightning.compute.jit import inline, kernel
 from nsvq_lightning.compute.memory import check_fit
 from nsvq_lightning.io.numbers import power_above, power_below
-from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int32s, Int64s, Integers, Uint64s
+from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int32s, Int64s, Integers, Uint64s, middle_of
 
 # Bits per coordinate: three coordinates make a key of 63 bits.
 AXIS_BITS = 21
@@ -154,8 +154,6 @@ def spatial_order(means: Float32s) -> Integers:
     stretch the bounds of is theirs alone; those within an eighth, a sixteenth, … of that come first, as what is near
     before a far background.
     """
-    from nsvq_lightning.rendering.frame import middle_of
-
     if not len(means):
         return np.arange(0)
     cells, _ = Grid.around(means, np.zeros(len(means))).cells(means)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.splats.conventions import Float64s, turned
+from nsvq_lightning.splats.conventions import Float64s, middle_of, turned
 
 if TYPE_CHECKING:
     from nsvq_lightning.rendering.frame import Frame
@@ -57,7 +57,6 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     """
     import torch
 
-    from nsvq_lightning.rendering.frame import middle_of
     from nsvq_lightning.rendering.sh import sh_rotation
 
     linear, shift = matrix[:3, :3], matrix[:3, 3] + matrix[:3, :3] @ scene.origin

@@ -296,9 +296,7 @@ def read_ply(path: StrPath) -> CompressedScene:
 def _near(means: Arrays) -> tuple[Arrays, Place]:
     """Positions ``[N, 3]`` relative to an origin, which is their middle if that is too far away for float32."""
     if means.dtype == np.float64 and len(finite := means[np.isfinite(means).all(1)]):
-        from nsvq_lightning.rendering.frame import middle_of  # imports torch
-
-        middle, usual = middle_of(finite)
+        middle, usual = conventions.middle_of(finite)
         if np.linalg.norm(middle) > FAR * usual:
             return means - middle, tuple(middle.tolist())
     return means, ZERO

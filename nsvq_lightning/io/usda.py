@@ -66,7 +66,7 @@ def write_usda(path: StrPath, scene: CompressedScene) -> int:
         return file.tell()
 
 
-def read_usda(path: Path) -> CompressedScene:
+def read_usda(path: StrPath) -> CompressedScene:
     """Read the splats of a ``.usda`` file with one prim of splats, without transforms.
 
     Attributes may be half as precise (``positionsh``), or samples in time, of which the first is read. A stage with z
@@ -75,7 +75,7 @@ def read_usda(path: Path) -> CompressedScene:
     Raises:
         FormatError: It is truncated, damaged or something else.
     """
-    data = path.read_bytes()
+    data = Path(path).read_bytes()
     with naming_file(path):
         if data.startswith((b"PXR-USDC", b"PK")):
             raise FormatError("binary OpenUSD (.usdc or .usdz); only text is read", BINARY_REMEDY)
@@ -116,7 +116,7 @@ def _rows(text: str, name: str, width: int) -> Float32s:
     for each in (name, f"{name}h"):
         value = r"(?:=|\.timeSamples\s*=\s*\{[^:\[]*:)\s*\[([^\]]*)\]"
         if found := re.search(rf"\[\]\s*{each}\s*{value}", text):
-            numbers = re.sub(r"[(),]", " ", found[1]).strip()
+            numbers = found[1].translate(dict.fromkeys(b"(),", " ")).strip()
             with as_defect(f"damaged: {name}", (ValueError, DeprecationWarning)), catch_warnings(action="error"):
                 return np.fromstring(numbers, np.float32, sep=" ").reshape(-1, width)
     raise FormatError(f"truncated: {name} has no end" if name in text else f"no attribute {name}")

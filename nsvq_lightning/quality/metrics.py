@@ -5,8 +5,7 @@ Rendered images are rounded to 8 bit first (:func:`eight_bit`), as if read back 
 """
 
 import torch
-from torch import Tensor
-from torchmetrics import Metric
+from torch import Tensor, nn
 
 from nsvq_lightning.quality.formulas import check_pair
 from nsvq_lightning.quality.loss import apply_mask, mean_of_kept
@@ -88,7 +87,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     return -10.0 * torch.log10(mean_of_kept(error.square() / image.numel(), mask))
 
 
-def build_lpips() -> tuple[Metric | None, str | None]:
+def build_lpips() -> tuple[nn.Module | None, str | None]:
     """LPIPS with VGG features as the tables of 3D Gaussian splatting compute it: images in [0, 1], not rescaled.
 
     Returns:

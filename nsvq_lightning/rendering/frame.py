@@ -15,7 +15,8 @@ from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.poses import viewmat_of
 from nsvq_lightning.rendering.sampling import Sampling
-from nsvq_lightning.splats.conventions import ZERO, Float32s, Float64s, Place
+from nsvq_lightning.splats.conventions import ZERO, Float64s, Place, usual_of
+from nsvq_lightning.splats.conventions import middle_of as middle_of  # also a word of frames
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
 # Extent of the cameras in a frame.
@@ -89,16 +90,5 @@ class Frame(NamedTuple):
 
 def reach_of(distances: Float64s) -> float:
     """The largest of distances ``[V]`` that is at most :data:`REACH` times what four fifths of them do not exceed."""
-    usual = _usual(distances)
+    usual = usual_of(distances)
     return float(distances[distances <= REACH * usual].max() if usual > 0 else distances.max())
-
-
-def middle_of(places: Float32s | Float64s) -> tuple[Float64s, float]:
-    """The median ``[3]`` of places ``[P, 3]``, P > 0, and the distance from it that four fifths do not exceed."""
-    middle = np.median(places.astype(np.float64), axis=0)
-    return middle, _usual(np.linalg.norm(places - middle, axis=1))
-
-
-def _usual(distances: Float64s) -> float:
-    """What four fifths of distances ``[V]`` do not exceed; it is one of them."""
-    return float(np.quantile(distances, 0.8, method="lower"))

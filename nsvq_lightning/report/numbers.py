@@ -6,11 +6,10 @@ from csv import DictWriter
 from io import StringIO
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from scipy import stats
 from torch import Tensor
 
 from nsvq_lightning.data.scene import View
@@ -24,8 +23,10 @@ from nsvq_lightning.quality.metrics import eight_bit, psnr
 from nsvq_lightning.splats.conventions import Integers
 from nsvq_lightning.splats.splats import SplatTensors
 from nsvq_lightning.training.importance import Renderer
-from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.schedule import Phase
+
+if TYPE_CHECKING:
+    from nsvq_lightning.training.module import SplatModule  # imports Lightning
 
 Values = Mapping[str, Any]
 Rows = Sequence[Values]
@@ -70,7 +71,7 @@ def evaluate(
 
 
 def summarize(
-    path: Path, scene: CompressedScene, scores: Rows, lpips_reason: str | None, module: SplatModule, paper: Header
+    path: Path, scene: CompressedScene, scores: Rows, lpips_reason: str | None, module: "SplatModule", paper: Header
 ) -> Json:
     """The content of ``metrics.json``; sizes in bytes, PSNR in dB, times in seconds.
 
@@ -115,6 +116,8 @@ def write_metrics(path: Path, metrics: Values) -> None:
 
 def _codes_in_use(codes: Integers, size: int) -> Json:
     """Rows of the codebook, how many of them are used, and the entropy of the codes, bits each."""
+    from scipy import stats  # slow to import
+
     counts = np.unique_counts(codes).counts
     return {"codebook": size, "used": len(counts), "entropy": float(stats.entropy(counts, base=2))}
 

@@ -12,18 +12,20 @@ from functools import lru_cache
 from hashlib import sha256
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unicodedata import normalize
 
 import cv2
 import torch
-from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
 from nsvq_lightning.data.images import read_image, write_pixels
 from nsvq_lightning.io.atomic import atomic_path, make_folder_of
 from nsvq_lightning.splats.conventions import Uint8s
 from nsvq_lightning.top_level import log
+
+if TYPE_CHECKING:
+    from lightning.pytorch.loggers import Logger
 
 # Bytes of a file name without suffix; file systems take 143 to 255 with it.
 LONGEST = 120
@@ -78,7 +80,7 @@ def write_png(path: Path, image: Tensor) -> None:
     write_pixels(path, as_bytes(image)[..., ::-1])
 
 
-def log_pictures(loggers: Sequence[Logger], pictures: Sequence[Path], step: int) -> None:
+def log_pictures(loggers: "Sequence[Logger]", pictures: Sequence[Path], step: int) -> None:
     """Show PNG files in TensorBoard and Weights & Biases, as ``test/<file name>``; other loggers get none.
 
     Args:
@@ -86,6 +88,8 @@ def log_pictures(loggers: Sequence[Logger], pictures: Sequence[Path], step: int)
         pictures: The files, 8-bit RGB.
         step: Iteration they belong to.
     """
+    from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger  # slow to import
+
     for logger in loggers:
         if isinstance(logger, WandbLogger):
             names = [path.stem for path in pictures]

@@ -108,3 +108,14 @@ def from_smallest_three(largest: NDArray[np.intp], others: Float64s) -> Float32s
     np.put_along_axis(quats, _OTHERS[largest], others, 1)
     np.put_along_axis(quats, largest[:, None], np.sqrt(np.maximum(0, 1 - np.square(others).sum(1)))[:, None], 1)
     return quats.astype(np.float32)
+
+
+def middle_of(places: Float32s | Float64s) -> tuple[Float64s, float]:
+    """The median ``[3]`` of places ``[P, 3]``, P > 0, and the distance from it that four fifths do not exceed."""
+    middle = np.median(places.astype(np.float64), axis=0)
+    return middle, usual_of(np.linalg.norm(places - middle, axis=1))
+
+
+def usual_of(distances: Float64s) -> float:
+    """What four fifths of distances ``[V]`` do not exceed; it is one of them."""
+    return float(np.quantile(distances, 0.8, method="lower"))

@@ -13,8 +13,7 @@ from nsvq_lightning.compression.viewpoints import look_at
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.rendering.camera import Camera
-from nsvq_lightning.rendering.frame import middle_of
-from nsvq_lightning.splats.conventions import Float64s
+from nsvq_lightning.splats.conventions import Float64s, middle_of
 from nsvq_lightning.splats.splats import RawSplats, Splats, detached
 
 SEED = 7

@@ -31,9 +31,8 @@ from nsvq_lightning.io.nsvq.header import AttributeEntry, Header, StreamEntry
 from nsvq_lightning.io.nsvq.precision import MAX_OPACITY_LEVELS, Precision
 from nsvq_lightning.io.nsvq.rounding import SMALL, Stored, doublings_of, leaf_paths, position_grid, rounded
 from nsvq_lightning.io.numbers import float_rows, logits_of
-from nsvq_lightning.rendering.frame import middle_of
 from nsvq_lightning.splats.attributes import QUANTIZABLE
-from nsvq_lightning.splats.conventions import Int32s, Int64s, Uint64s
+from nsvq_lightning.splats.conventions import Int32s, Int64s, Uint64s, middle_of
 
 # Attributes by when their streams come; the cells of the positions, which are between, follow from the early ones.
 _EARLY = ("opacities", "scales")
