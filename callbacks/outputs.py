@@ -26,9 +26,9 @@ from .base import WritingCallback, picture_file
 class ExportScene(WritingCallback):
     """Writes the scene when training ends.
 
-    The compressed scene is ``scene.nsvq``, and ``scene.ply`` has its decoded splats, for any viewer, or
-    without codebooks those that were trained. With ``scene.nsvq`` come ``viewer.html``, a page that holds it and shows it in a browser, and ``cameras.json``, the
-    cameras of the photos, for commands that look at the run where there are no photos.
+    The compressed scene is ``scene.nsvq``, and ``scene.ply`` has its decoded splats, for any viewer, or without
+    codebooks those that were trained. With ``scene.nsvq`` come ``viewer.html``, a page that holds it and shows it in a
+    browser, and ``cameras.json``, the cameras of the photos, for commands that look at the run where there are none.
 
     Raises:
         ValueError: An unknown format.
