@@ -47,7 +47,8 @@ class ExposureCompensation(SplatCallback):
         need = "exposures are those of the train photos"
         scene = run_scene.needed_scene(trainer, need, "leave out ExposureCompensation")
         self._row = {view: row for row, view in enumerate(scene.train)}
-        start = torch.nn.functional.pad(torch.diag_embed(exposures(scene) - 1), (0, 1))
+        found = exposures(scene)
+        start = torch.nn.functional.pad(torch.diag_embed(found / found.mean(0) - 1), (0, 1))
         if self._loaded:
             start = self._loaded["changes"].clone()
             if len(start) != len(scene.train):

@@ -15,8 +15,9 @@ from torch.utils.data import DataLoader, Dataset, IterableDataset, get_worker_in
 
 from nsvq_lightning.data.colmap import SceneError, size_range
 from nsvq_lightning.data.images import Picture
-from nsvq_lightning.data.scene import Factor, Scene, View, load_scene, spread, usable
+from nsvq_lightning.data.scene import Factor, Scene, View, load_scene, spread, uneven, usable
 from nsvq_lightning.random import generator
+from nsvq_lightning.top_level import log
 
 
 def view_order(n_views: int, seed: int, rank: int = 0, world_size: int = 1, start: int = 0) -> Iterator[int]:
@@ -121,6 +122,8 @@ class SceneDataModule(LightningDataModule):
             return self._scene
         scene = usable(self._scene())
         rank_zero_info(_summary(scene))
+        if remark := uneven(scene):
+            log.warning(f"the photos of {scene.root} {remark}")
         return scene
 
     def setup(self, stage: str | None = None) -> None:

@@ -530,7 +530,8 @@ def exposures(scene: Scene) -> Tensor:
         return torch.ones(len(scene.train), 3)
     places, levels = spread(scene.points, 2000).double().numpy(), []
     for index in scene.train:
-        sums, photos, _ = colors_at(replace(scene, train=(index,)), places, 5)
+        sums, photos, _ = colors_at(replace(scene, train=(index,)), places, 5, of_near=True)
+        photos[photos < np.quantile([*photos[photos > 0], 0], 2 / 3)] = np.nan  # what is far may be behind a wall
         levels.append(torch.from_numpy(sums + photos).float() / torch.from_numpy(photos).float())  # NaN where not shown
     logs = torch.stack(levels).log()
     return (logs - logs.nanmedian(0).values).nanmedian(1).values.nan_to_num(0).exp()
@@ -584,8 +585,6 @@ def usable(scene: Scene) -> Scene:
     if is_elsewhere(scene):
         log.warning(f"the points of {scene.root} {ELSEWHERE}; random ones take their place")
         return replace(scene.with_random_points(), extent=EXTENT * scene.frame.unit)
-    if remark := uneven(scene):
-        log.warning(f"the photos of {scene.root} {remark}")
     return scene
 
 

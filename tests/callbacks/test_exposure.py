@@ -91,7 +91,8 @@ def test_points_tell_exposures_of_photos(
     fit(uneven_scene, tmp_path, [compensation], 1)
     assert ("differ in brightness" in caplog.text) == bool(uneven(scene))
     start = compensation.state_dict()["changes"][:, :, :3].diagonal(dim1=1, dim2=2) + 1
-    torch.testing.assert_close(start, found, atol=0.01, rtol=0)
+    # Their mean is kept at 1: no gain is below 0, however many photos are dark.
+    torch.testing.assert_close(start, found / found.mean(0), atol=0.01, rtol=0)
 
 
 def test_a_resumed_run_has_the_same_bits(uneven_scene: Path, tmp_path: Path) -> None:
