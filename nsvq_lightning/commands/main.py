@@ -257,7 +257,9 @@ def _is_ours(error: BaseException) -> bool:
     if not isinstance(error, ValueError | TypeError | OSError | RuntimeError | ArithmeticError | ImportError):
         return False
     modules = [str(frame.f_globals.get("__name__")) for frame, _ in walk_tb(error.__traceback__)]
-    return modules[-1].startswith(("nsvq_lightning.", "lightning."))
+    # Lightning's own: other kinds come of calls of what is not its own.
+    told = ("nsvq_lightning.", "lightning.") if isinstance(error, ValueError) else "nsvq_lightning."
+    return modules[-1].startswith(told)
 
 
 class BarHandler(logging.StreamHandler[TextIO]):

@@ -383,7 +383,7 @@ def as_quantizer(module: object) -> Quantizer:
             "nsvq_lightning.quantize.CodebookQuantizer, or offer the members of nsvq_lightning.quantize.Quantizer"
         )
     quantizer = cast(Quantizer, module)
-    bare = getattr(type(module), "forward", None) is nn.Module.forward  # which every module has
+    bare = getattr(quantizer.forward, "__func__", None) is nn.Module.forward  # which every module has
     if bare or not isinstance(module, nn.Module) or not isinstance(quantizer.codebook, nn.Parameter):
         raise TypeError(
             f"{type(module).__name__} is not a quantizer: it must be an nn.Module with a forward, whose codebook is an "

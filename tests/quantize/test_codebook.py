@@ -286,6 +286,7 @@ def test_a_quantizer_needs_a_forward_of_its_own() -> None:
 
     with pytest.raises(TypeError, match=r"Forgetful is not a quantizer: it must be an nn\.Module with a forward"):
         as_quantizer(Forgetful(4, 3))
+    assert as_quantizer(compiled := torch.compile(NSVQ(4, 3), backend="eager")) is compiled
 
 
 def test_a_codebook_that_nothing_trains_is_refused() -> None:
