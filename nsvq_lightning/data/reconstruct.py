@@ -388,8 +388,8 @@ RAW = (".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2", "
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
 # Names of folders that hold something else than photos, or the same photos again, and of files that are such.
 OTHER = re.compile(
-    r"\..*|__MACOSX|@eaDir|#recycle|\$RECYCLE\.BIN|(.*_)?(masks?|depths?|normals?|semantics)|conf(idence)?|depth_?maps|(un)?distorted|dense|"
-    r"corrected_images|\.?thumb.*|images_\d+|[248]x|sparse|runs",
+    r"\..*|__MACOSX|@eaDir|#recycle|\$RECYCLE\.BIN|(.*_)?(masks?|depths?|normals?|semantics)|conf(idence)?|depth_?maps|"
+    r"(un)?distorted|dense|corrected_images|\.?thumb.*|images_\d+|[248]x|sparse|runs",
     re.IGNORECASE,
 )
 OTHER_FILES = re.compile(r"thumbnail|(thumb|conf|depth|mask)_\d+|.*\d_(mask|depth|normal)(_\d+)?", re.IGNORECASE)

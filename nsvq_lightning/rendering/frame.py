@@ -16,7 +16,7 @@ from nsvq_lightning.rendering.constants import NEAR
 from nsvq_lightning.rendering.poses import viewmat_of
 from nsvq_lightning.rendering.sampling import Sampling
 from nsvq_lightning.splats.conventions import ZERO, Float64s, Place, usual_of
-from nsvq_lightning.splats.conventions import middle_of as middle_of  # also a word of frames
+from nsvq_lightning.splats.conventions import middle_of as middle_of  # known from here, too
 from nsvq_lightning.splats.splats import RawSplats, SplatTensors, detached
 
 # Extent of the cameras in a frame.

@@ -931,7 +931,9 @@ async function main() {
   element("embed").hidden = server;
   new ResizeObserver(() => {
     resize();
-    if (sorted) draw(share); // at once: browsers show the cleared canvas before the next frame
+    if (!sorted) return;
+    draw(share); // at once: browsers show the cleared canvas before the next frame
+    schedule();
   }).observe(canvas);
 
   window.nsvqViewer = {
