@@ -38,6 +38,7 @@ from nsvq_lightning.top_level import log
 from nsvq_lightning.training import importance
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.optim import LearningRates
+from nsvq_lightning.training.run_scene import telling_views
 from nsvq_lightning.training.schedule import Phase
 from nsvq_lightning.training.trainer import SplatTrainer
 
@@ -431,7 +432,7 @@ class Compressor:
         In those of a part alone, what shows through its splats is missing, so all of them seem to be needed.
         """
         splats, signs = importance.below_cap(self._splats), generator(self.seed, 0, "signs")
-        views = map(self.data.scene.view, spread(self.data.scene.train, VIEWS))
+        views = map(self.data.scene.view, telling_views(self.data.scene, VIEWS))
         found = (importance.sensitivity(splats, each.camera, self._render, signs, each.mask)[0] for each in views)
         return importance.likely_effects(splats, sum((each.opacities for each in found), torch.zeros(())))
 

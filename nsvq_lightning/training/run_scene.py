@@ -1,7 +1,7 @@
 """What a run takes from its scene: extent, background, first splats, how much each splat shows in the train views."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -92,11 +92,18 @@ def train_sensitivities(
     """
     need = "what shows of splats is seen in the train views"
     scene = needed_scene(trainer, need, "leave out the callbacks that ask (selection, rate_distortion)")
-    # Of a walk, few photos show each place: those of none would cost nothing.
-    for index in spread(scene.train, max(most, len(scene.train) // 4))[trainer.global_rank :: trainer.world_size]:
+    for index in telling_views(scene, most)[trainer.global_rank :: trainer.world_size]:
         view = scene.view(index).to(splats.means.device)
         signs = generator(seed, trainer.global_step, "signs", index)
         yield view, *sensitivity(splats, view.camera, trained.render, signs, view.mask)
+
+
+def telling_views(scene: Scene, most: int) -> Sequence[int]:
+    """At most so many of the train views, or a fourth of them where that is more.
+
+    Of a walk, few photos show each place, and splats that none of these shows would cost nothing.
+    """
+    return spread(scene.train, max(most, len(scene.train) // 4))
 
 
 def extent_of(trainer: Trainer) -> float:
