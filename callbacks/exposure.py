@@ -47,9 +47,10 @@ class ExposureCompensation(SplatCallback):
         need = "exposures are those of the train photos"
         scene = run_scene.needed_scene(trainer, need, "leave out ExposureCompensation")
         self._row = {view: row for row, view in enumerate(scene.train)}
-        found = exposures(scene)
-        start = torch.nn.functional.pad(torch.diag_embed(found / found.mean(0) - 1), (0, 1))
-        if self._loaded:
+        if not self._loaded:
+            found = exposures(scene)
+            start = torch.nn.functional.pad(torch.diag_embed(found / found.mean(0) - 1), (0, 1))
+        else:
             start = self._loaded["changes"].clone()
             if len(start) != len(scene.train):
                 raise ValueError(
