@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from lightning.pytorch import Trainer
 from torch import Tensor
+from torch.optim import Optimizer
 
 from nsvq_lightning.quality.loss import apply_mask
 from nsvq_lightning.quality.metrics import color_corrected, eight_bit
@@ -241,7 +242,7 @@ class CodebookRefit(SplatCallback):
         if self.is_due(module, iteration) and _refittable(module):
             keep_finite_splats(module)
 
-    def on_before_optimizer_step(self, trainer: Trainer, module: SplatModule, optimizer: Any) -> None:
+    def on_before_optimizer_step(self, trainer: Trainer, module: SplatModule, optimizer: Optimizer) -> None:
         """Refit when due, on the first process."""
         iteration = trainer.global_step + 1
         if not self.is_due(module, iteration):
