@@ -34,14 +34,17 @@ Factor = Annotated[float, Bound("in (0, 1]", lambda value: 0 < value <= 1)]
 
 
 def check_settings(callback: object) -> None:
-    """Check what is annotated with a bound, by the class of a callback or one above it.
+    """Check what is annotated, by the class of a callback or one above it.
 
     Raises:
-        ValueError: A setting is out of its bound, or not finite.
+        ValueError: A setting is out of its bound, not finite, or None where its type does not allow that.
     """
     for name, hint in get_type_hints(type(callback), include_extras=True).items():
         value = getattr(callback, name, None)
-        for kind in (hint, *get_args(hint)):  # of ``Count | None``, each
+        kinds = hint, *get_args(hint)  # of ``Count | None``, each
+        if value is None and type(None) not in kinds and hasattr(callback, name):
+            raise ValueError(f"{name} must have a value, got None")
+        for kind in kinds:
             for bound in getattr(kind, "__metadata__", ()):
                 if isinstance(bound, Bound) and value is not None and not (math.isfinite(value) and bound.holds(value)):
                     raise ValueError(f"{name} must be {bound.words}, got {value}")

@@ -179,6 +179,8 @@ OUT_OF_RANGE = [
     (DensityControl, {"min_opacity": 0.0}, "min_opacity must be between 0 and 1, got 0.0"),
     (DensityControl, {"shrink": 0.0}, "shrink must be above 0, got 0.0"),
     (DensityControl, {"grad_threshold": -1.0}, "grad_threshold must be at least 0, got -1.0"),
+    (DensityControl, {"reset_last": None}, "reset_last must have a value, got None"),
+    (PhaseSchedule, {"warmup_end": None}, "warmup_end must have a value, got None"),
     (DensityControl, {"max_splats": 3}, "max_splats must be at least min_splats=10, got 3"),
     (BudgetedGrowth, {"start": -1}, "start must be at least 0, got -1"),
     (BudgetedGrowth, {"grad_threshold": math.nan}, "grad_threshold must be at least 0, got nan"),
