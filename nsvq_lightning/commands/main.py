@@ -99,6 +99,13 @@ def _end(number: int, frame: Any) -> None:
     raise KeyboardInterrupt
 
 
+def _words(error: Exception) -> str:
+    """What an error says; where it is the system's, of which file."""
+    if isinstance(error, OSError) and error.strerror is not None and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
 def _failed(message: str, status: int = 1) -> int:
     """Say why a command has failed; returns its exit status."""
     sys.stderr.write(f"{message}\n")
@@ -165,10 +172,7 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     except ArgumentError as error:
         parser.error(str(error))
     except (ValueError, OSError) as error:
-        text = str(error)
-        if isinstance(error, OSError) and error.filename is not None:
-            text = f"{error.filename}: {error.strerror}"
-        return _failed(f"nsvq {name}: {text}")
+        return _failed(f"nsvq {name}: {_words(error)}")
 
 
 def _run_lightning(arguments: list[str], own_process: bool) -> int:
@@ -182,7 +186,7 @@ def _run_lightning(arguments: list[str], own_process: bool) -> int:
         sys.stderr.write(f"error: {error}\nAll options: nsvq {arguments[0]} --help\n")
         sys.exit(2)
     except (ValueError, OSError) as error:
-        return _failed(f"error: {error}")
+        return _failed(f"error: {_words(error)}")
     # Fragments of Lightning's and torch's warnings that a user of this command can do nothing about.
     not_actionable = (
         "does not have many workers",  # views come from a cache in memory; each worker would hold a copy
@@ -221,7 +225,7 @@ def _run_lightning(arguments: list[str], own_process: bool) -> int:
         speaks = names_file or isinstance(error, MisconfigurationException) or _is_ours(error)
         if os.environ.get(TRACEBACK) or not speaks:
             raise
-        return _failed(f"error: {error}\n({TRACEBACK}=1 shows where)")
+        return _failed(f"error: {_words(error)}\n({TRACEBACK}=1 shows where)")
     return 0
 
 

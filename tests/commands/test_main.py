@@ -186,6 +186,8 @@ SCENE = ["--config=demo", "--callbacks.progress=null"]
         ("--callbacks.density.budget=1", "budget must be at least min_splats=10, got 1"),
         ('--callbacks.density={"class_path": "DensityControl", "init_args": {"max_splats": -1}}', "max_splats must be"),
         ("--callbacks.report.every=-1", "every must be at least 0, got -1"),
+        ("--callbacks.report.every=null", "every must have a value, got None"),
+        ("--ckpt_path=none.ckpt", "none.ckpt: No such file or directory"),
         ("--trainer.logger=MLFlowLogger", "mlflow"),
         ("--trainer.accelerator=gpu", "No supported gpu backend found"),
         ("--model.quantizer=nn_modules.NoQuantizer", "NoQuantizer is not a quantizer; it lacks: codebook, codes"),
