@@ -112,7 +112,8 @@ class ColmapModel:
         source: Where it comes from, for messages.
         images_folder: Folder of the photos, where the model says so.
         test: Rows of the test images, where the model says so.
-        cloud: Whether the points are those of another file, which may be in other coordinates than the cameras.
+        cloud: Whether the points are those of another file or program, which may be in other coordinates than the
+            cameras.
         synthetic: Whether it is a NeRF-synthetic scene, whose transparent pixels are white by convention.
     """
 
@@ -274,6 +275,7 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
         colors=rgb_bytes(points.rgb),
         observations=_observations(rows, points.tracks) if observations else None,
         images_folder=next((str(each.absolute()) for each in beside if each.is_dir()), None),
+        cloud=not points.seen,
     )
 
 

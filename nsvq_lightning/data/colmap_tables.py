@@ -68,11 +68,13 @@ class PointTable(NamedTuple):
         xyz: ``[P, 3]`` float64, scene units.
         rgb: ``[P, 3]`` float64, as they are in the file.
         tracks: Identifiers of the images that saw each point; none unless requested.
+        seen: Whether two images saw any of them: SfM's are, those of scanners that others wrote into the table are not.
     """
 
     xyz: Float64s
     rgb: Float64s
     tracks: Sequence[Sequence[int]]
+    seen: bool = False
 
 
 def read_cameras(path: Path) -> list[CameraRow]:
@@ -114,7 +116,8 @@ def read_points(path: Path, tracks: bool = False) -> PointTable:
         records = _point_lines(path, tracks)
     points = sorted(records, key=lambda point: point[0])
     values = np.array([point[1:7] for point in points], np.float64).reshape(-1, 6)
-    return PointTable(values[:, :3], values[:, 3:], [[int(image) for image in point[7:]] for point in points])
+    images = [[int(image) for image in point[8:]] for point in points]
+    return PointTable(values[:, :3], values[:, 3:], images, any(point[7] > 1 for point in points))
 
 
 def announced_rows(path: Path) -> int:
@@ -190,8 +193,8 @@ def _point_record(data: mmap.mmap, start: int, tracks: bool) -> tuple[_Point, in
     first = start + _POINT.size
     end = first + 8 * length
     if end > len(data) or not tracks:
-        return tuple(values), end
-    return (*values, *struct.unpack_from(f"<{2 * length}I", data, first)[::2]), end
+        return (*values, length), end
+    return (*values, length, *struct.unpack_from(f"<{2 * length}I", data, first)[::2]), end
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -260,4 +263,5 @@ def _point_lines(path: Path, tracks: bool) -> Iterator[_Point]:
             raise ValueError(f"line {line} has {len(words)} words; a point has identifier, position of 3, colour of 3")
         if len(words) == 6 or _numbers(line, words[:1])[0] % 1:  # DPVO's have an error and a track
             words = [str(line), *words]
-        yield tuple(_numbers(line, [*words[:7], *(words[8::2] if tracks else ())]))
+        images = words[8::2]
+        yield (*_numbers(line, words[:7]), len(images), *_numbers(line, images if tracks else ()))

@@ -414,6 +414,23 @@ def test_points_that_are_not_where_photos_show_them_make_way(
         assert seen_by(found.train_cameras, found.points.numpy()).any(0).mean() > 0.9
 
 
+@pytest.mark.parametrize("track", ["", " 1 0"])
+def test_points_of_a_table_that_no_two_photos_saw_may_be_elsewhere(
+    demo_scene: Path, tmp_path: Path, track: str
+) -> None:
+    for move in ("right", "turned"):
+        root = cloud_scene(demo_scene, tmp_path / move, move)
+        scene = load_scene(root)
+        (root / "points3D.ply").unlink()
+        lines = []
+        for number, (point, color) in enumerate(zip(scene.points.tolist(), scene.colors.tolist(), strict=True), 1):
+            rgb = [round(255 * channel) for channel in color]
+            lines.append(" ".join(map(str, [number, *point, *rgb, 0])) + track + "\n")
+        (root / "sparse/0/points3D.txt").write_text("".join(lines))
+        scene = load_scene(root)
+        assert (scene.cloud, scene.grey, is_elsewhere(scene)) == (True, False, move == "turned")
+
+
 def test_points_are_taken_where_nothing_says_that_they_are_wrong(demo_scene: Path, tmp_path: Path) -> None:
     for contrast, colourless in ((0.0, True), (100.0, False)):
         scene = load_scene(cloud_scene(demo_scene, tmp_path / str(contrast), "turned", contrast))
