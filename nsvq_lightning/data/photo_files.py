@@ -51,7 +51,7 @@ def locate(
     files = _Files(folder, free, whole=bool(exact))
     used: dict[Path, str] = {}
     for name in sorted(paths.keys() - exact):
-        fitting = files.nearest(name)
+        fitting = files.nearest(name) or files.nearest(name.rpartition(".")[0])  # HEIC and raw ones, converted
         if not fitting:
             check_name(name, source, allow_outside)
             continue

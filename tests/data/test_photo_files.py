@@ -41,6 +41,7 @@ def masks_of(root: Path, folder: str, *names: str) -> list[Path | None]:
         (["C:\\scan\\1.jpg"], ["1.jpg"]),
         (["../raw/1.jpg"], ["1.jpg"]),
         (["1.jpg", "2.jpg"], ["sub/1.jpg", "sub/2.jpg"]),
+        (["IMG_1.HEIC", "a/2.CR2"], ["img_1.jpg", "a/2.png", "3.jpg"]),
     ],
 )
 def test_a_name_is_taken_for_the_nearest_photo(
