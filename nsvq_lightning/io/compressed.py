@@ -199,6 +199,8 @@ class CompressedScene:
             raise ValueError("some scenes were trained with anti-aliasing and some were not; they cannot be joined")
         if len({scene.background for scene in scenes}) > 1:
             log.warning("some scenes are seen before white, some before black; the first decides what is behind all")
+        if len({any(scene.origin) for scene in scenes}) > 1:
+            log.warning("only some scenes say where 0 is on a map: those that do not, such as a .ply, may be misplaced")
         degree = max(scene.sh_degree for scene in scenes)
         scenes = [scene.with_degree(degree) for scene in scenes]
         codes, codebooks, raw = {}, {}, {}

@@ -20,6 +20,7 @@ from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, Json, as_defect, naming_file
 from nsvq_lightning.io.sog import META, PALETTE_LIMIT, read_sog, sog_contents
 from nsvq_lightning.splats.conventions import Float64s, Integers, unit
+from nsvq_lightning.top_level import log
 
 NAME = "lod-meta.json"
 
@@ -155,7 +156,7 @@ _MAX_BYTES = 1 << 26
 
 
 def _index(path: Path) -> dict[str, list[str]]:
-    """Of ``lod-meta.json``: names ``shown``, of the finest level and what surrounds the scene; ``own``, all of ours."""
+    """Of ``lod-meta.json``, names: ``shown``, the finest level and what surrounds it; ``all``; ``own``, all of ours."""
     with naming_file(path):
         if path.stat().st_size > _MAX_BYTES:
             raise FormatError(f"damaged: an index cannot have {path.stat().st_size} bytes")
@@ -179,7 +180,7 @@ def _index(path: Path) -> dict[str, list[str]]:
             raise FormatError(f"incomplete: {absent[0]} is missing", "copy the whole folder again")
         if (version := index.get("version", 1)) != 1:  # the first writers stated none
             raise FormatError(f"version {str(version)[:40]} of the format; this release reads version 1")
-    return {"shown": shown, "own": names if index.get("asset") == _ASSET else []}
+    return {"shown": shown, "all": names, "own": names if index.get("asset") == _ASSET else []}
 
 
 def _is_beside(name: PurePosixPath) -> bool:
@@ -195,7 +196,10 @@ def read_lod(path: StrPath) -> CompressedScene:
         OSError: A file cannot be read.
     """
     path = Path(path)
-    parts = [read_sog(path.parent / name) for name in _index(path)["shown"]]
+    index = _index(path)
+    parts = [read_sog(path.parent / name) for name in index["shown"]]
+    if coarser := len({*index["all"]}.difference(index["shown"])):
+        log.info(f"{path}: coarser levels, {coarser} files, are not read: nsvq compress makes them anew")
     size = path.stat().st_size + sum(part.stored_bytes or 0 for part in parts)
     # The surroundings may be of another kind; splats are shown as one.
     return replace(CompressedScene.joined([replace(part, config=parts[0].config) for part in parts]), stored_bytes=size)

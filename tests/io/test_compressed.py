@@ -56,6 +56,15 @@ def test_cameras_of_some_scenes_are_not_those_of_all(caplog: pytest.LogCaptureFi
     assert "of some scenes the cameras of their training are known, of some not" in caplog.text
 
 
+def test_places_on_a_map_are_told_where_only_some_scenes_have_one(caplog: pytest.LogCaptureFixture) -> None:
+    near = plain_scene(5, 1)
+    far = replace(near, origin=(4e5, 5e6, 0.0))
+    CompressedScene.joined([far, far])
+    assert not [record for record in caplog.records if "on a map" in record.message]
+    CompressedScene.joined([far, near])
+    assert "only some scenes say where 0 is on a map" in caplog.text
+
+
 def test_activations_instead_of_logits_are_told(caplog: pytest.LogCaptureFixture) -> None:
     rows = plain_scene(20, 1).tensors()._asdict()
     CompressedScene.from_splats(rows)

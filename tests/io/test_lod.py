@@ -107,6 +107,16 @@ def test_levels_of_other_origins_are_put_in_place(tmp_path: Path) -> None:
     assert bounds["max"][0] - bounds["min"][0] < 1.5 * np.ptp(scene.means[:, 0])
 
 
+def test_levels_that_are_not_read_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", logger="nsvq_lightning")
+    path = tmp_path / "lod-meta.json"
+    for coarser in ([], [plain_scene(7, 1)]):
+        save(plain_scene(20, 1), path, coarser=coarser)
+        caplog.clear()
+        assert len(read_scene(path)) == 20
+        assert ("coarser levels, 1 files, are not read" in caplog.text) == (len(coarser) == 1)
+
+
 def test_levels_become_coarser(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"fewer splats than the one before it, got \[20, 20\]"):
         save(plain_scene(20, 1), tmp_path / "lod-meta.json", coarser=[plain_scene(20, 1)])
