@@ -196,19 +196,18 @@ def _flows(a: _Photo, b: _Photo, stride: int) -> list[_Points]:
 def _followed(a: _Photo, b: _Photo, there: Float32s, back: Float32s, stride: int) -> _Points:
     """The pixels of ``a``, every ``stride``-th, that the flow leads to ``b`` and back again, triangulated."""
     height, width = a.grey.shape
-    flow = there[:height, :width]
-    starts = np.moveaxis(np.mgrid[:height, :width][::-1], 0, 2).astype(np.float32)
+    every = np.s_[:height:stride, :width:stride]
+    flow = there[every]
+    starts = np.moveaxis(np.mgrid[every][::-1], 0, 2).astype(np.float32)
     ends = starts + flow
     returned = flow + cv2.remap(back, ends, None, cv2.INTER_LINEAR)
     inside = (ends > 1) & (ends < np.array(b.grey.shape[::-1]) - 2)
     good = (norm(returned, axis=2) < MAX_ERROR) & inside.all(2)
     if a.counts is not None:
-        good &= a.counts
+        good &= a.counts[every]
     if b.counts is not None:
         good &= cv2.remap(b.counts.view(np.uint8), ends, None, cv2.INTER_NEAREST) > 0
-    rows, columns = (stride * found for found in np.nonzero(good[::stride, ::stride]))
-    start = starts[rows, columns].astype(np.float64) + 0.5
-    return _triangulated(a, b, start, ends[rows, columns].astype(np.float64) + 0.5)
+    return _triangulated(a, b, starts[good].astype(np.float64) + 0.5, ends[good].astype(np.float64) + 0.5)
 
 
 def _matched(a: _Photo, b: _Photo) -> _Points:
