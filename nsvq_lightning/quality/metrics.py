@@ -26,26 +26,25 @@ def color_corrected(image: Tensor, photo: Tensor, mask: Tensor | None = None) ->
     Returns:
         ``[H, W, 3]`` in [0, 1], of the image's dtype.
     """
-    colors = image.reshape(-1, 3).double()
-    target = photo.reshape(-1, 3).double()
-    counting = torch.ones_like(colors[:, 0], dtype=torch.bool) if mask is None else mask.ravel()
+    colors, target = (each.reshape(-1, 3).T.contiguous().double() for each in (image, photo))  # a row a channel
+    counting = torch.ones_like(colors[0], dtype=torch.bool) if mask is None else mask.ravel()
     dark, bright = 0.5 / 255, 1 - 0.5 / 255  # beyond these, a pixel is clipped and says nothing about the map
-    seen = counting[:, None] & (target >= dark) & (target <= bright) & (colors >= dark) & (colors <= bright)
-    parts = [slice(start, start + AT_ONCE) for start in range(0, len(colors), AT_ONCE)]
+    seen = counting & (target >= dark) & (target <= bright) & (colors >= dark) & (colors <= bright)
+    parts = [slice(start, start + AT_ONCE) for start in range(0, len(counting), AT_ONCE)]
     for _ in range(5):
         normal = colors.new_zeros(3, TERMS, TERMS)
-        moment = colors.new_zeros(3, TERMS)
+        moment = colors.new_zeros(3, TERMS, 1)
         for part in parts:
-            terms = _terms(colors[part])
-            unclipped = seen[part] & (colors[part] >= dark) & (colors[part] <= bright)
-            weighted = terms[:, None] * unclipped[..., None]  # [pixels, channel, term]
-            normal += (weighted.flatten(1).T @ terms).view_as(normal)
-            moment += (weighted * target[part][..., None]).sum(0)
+            some = colors[:, part]
+            terms = _terms(some)
+            weighted = terms * (seen[:, part] & (some >= dark) & (some <= bright))[:, None]  # [channel, term, pixels]
+            normal += weighted @ terms.T
+            moment += weighted @ target[:, part, None]
         # A picture of few colours leaves coefficients open; the pseudo-inverse takes the smallest.
-        weights = torch.linalg.pinv(normal, hermitian=True) @ moment[..., None]
-        corrected = torch.cat([_terms(colors[part]) @ weights[..., 0].T for part in parts])
-        colors = torch.where(normal[:, -1, -1] > 0, corrected, colors).clamp(0, 1)
-    return colors.reshape(image.shape).to(image.dtype)
+        weights = (torch.linalg.pinv(normal, hermitian=True) @ moment)[..., 0]
+        corrected = torch.cat([weights @ _terms(colors[:, part]) for part in parts], 1)
+        colors = torch.where(normal[:, -1, -1:] > 0, corrected, colors).clamp(0, 1)
+    return colors.T.contiguous().reshape(image.shape).to(image.dtype)
 
 
 # Terms of a polynomial of degree two in three colours, the constant last; pixels that fit the caches of a processor.
@@ -54,9 +53,9 @@ AT_ONCE = 1 << 14
 
 
 def _terms(colors: Tensor) -> Tensor:
-    """The terms ``[N, 10]`` of colours ``[N, 3]``."""
+    """The terms ``[10, N]`` of colours ``[3, N]``."""
     first, second = torch.triu_indices(3, 3)  # each pair of channels once
-    return torch.cat([colors[:, first] * colors[:, second], colors, torch.ones_like(colors[:, :1])], 1)
+    return torch.cat([colors[first] * colors[second], colors, torch.ones_like(colors[:1])])
 
 
 def eight_bit(image: Tensor) -> Tensor:
