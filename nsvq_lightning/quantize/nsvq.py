@@ -19,11 +19,17 @@ class NSVQ(CodebookQuantizer):
 
     In training ``x_q = x + ‖x − c‖ · v / ‖v‖`` with c the nearest code and v ~ N(0, I), so gradients reach both the
     input and the code. Outside training, and once codes are frozen, ``x_q`` is the code itself.
+
+    Attributes:
+        aim: Weight of c − x in the direction, added to v.
+        sigma: σ, the standard deviation of v.
     """
+
+    aim, sigma = 0.0, 1.0
 
     def approximate(self, x: Tensor, codes: Tensor, generator: Generator, rows: Tensor | None) -> Tensor:
         """Noise substitution of the rows ``rows [V]`` of ``x [N, D]`` whose nearest codes are ``codes [V]``."""
-        return noise_substitution(x, self.codebook, codes, generator, rows)
+        return noise_substitution(x, self.codebook, codes, generator, rows, aim=self.aim, spread=self.sigma)
 
 
 def noise_substitution(
@@ -109,7 +115,7 @@ def _unit(vectors: Tensor) -> Tensor:
     return torch.nn.functional.normalize(vectors, eps=torch.finfo(vectors.dtype).tiny)
 
 
-class DiVeQ(CodebookQuantizer):
+class DiVeQ(NSVQ):
     """Quantizer that moves the input by the length of the error, approximately towards the code.
 
     In training ``x_q = x + ‖c − x‖ · sg(d / ‖d‖)`` with ``d = (c − x) + v`` and v ~ N(0, σ²I), c the nearest code and
@@ -129,12 +135,10 @@ class DiVeQ(CodebookQuantizer):
         ValueError: An argument is out of range.
     """
 
+    aim = 1.0
+
     def __init__(self, num_codes: int, dim: int, *, sigma: float = 1e-3, **settings: Any) -> None:
         super().__init__(num_codes, dim, **settings)
         if not 0 <= sigma < math.inf:
             raise ValueError(f"sigma must be finite and at least 0, got {sigma}")
         self.sigma = sigma
-
-    def approximate(self, x: Tensor, codes: Tensor, generator: Generator, rows: Tensor | None) -> Tensor:
-        """Rows ``rows [V]`` of ``x [N, D]``, moved approximately to their codes."""
-        return noise_substitution(x, self.codebook, codes, generator, rows, aim=1.0, spread=self.sigma)
