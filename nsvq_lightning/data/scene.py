@@ -591,7 +591,7 @@ def usable(scene: Scene) -> Scene:
 
 # The near plane is at most so many times as far away as the nearest hundredth of the points is from its cameras, and at
 # least so many times as far as it is where cameras go around what they show.
-_NEAREST, _LEAST_NEAR = 0.25, 1e-3
+_NEAREST, _MIN_NEAR = 0.25, 1e-3
 
 
 def _framed(model: ColmapModel, root: Path, origin: Place) -> tuple[ColmapModel, Frame, float]:
@@ -611,7 +611,7 @@ def _framed(model: ColmapModel, root: Path, origin: Place) -> tuple[ColmapModel,
         log.info(f"{root}: positions are relative to {origin}, as 0 is {distance:.0f} extents away")
     points = spread(model.points[np.isfinite(model.points).all(1)], SOME_SPLATS)
     nearest = np.quantile(cKDTree(centres).query(points)[0], 0.01) if len(points) else math.inf
-    near = frame.near * float(np.clip(_NEAREST * nearest / frame.near, _LEAST_NEAR, 1))
+    near = frame.near * float(np.clip(_NEAREST * nearest / frame.near, _MIN_NEAR, 1))
     if not any(origin):
         return model, frame, near
     views = np.stack([image.viewmat for image in model.images])

@@ -17,7 +17,7 @@ SSIM_SIGMA = 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 # Where the loss is for PSNR: weight of the logarithm of the mean squared error, 0.0037 for a decibel; and what is added
 # to that error, as nobody sees what is beyond 50 dB.
-LOG_WEIGHT, LEAST_ERROR = 0.016, 1e-5
+LOG_WEIGHT, MIN_ERROR = 0.016, 1e-5
 C1, C2 = F(SSIM_C1), F(SSIM_C2)
 # Planes of the moments; of the derivatives of SSIM by three of them, blurred p, p² and p·q.
 MOMENTS, DERIVATIVES = 4, 3

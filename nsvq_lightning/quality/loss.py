@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nsvq_lightning.compute.devices import kernels_for
-from nsvq_lightning.quality.formulas import LEAST_ERROR, LOG_WEIGHT, check_pair, in_range, plain_ssim
+from nsvq_lightning.quality.formulas import LOG_WEIGHT, MIN_ERROR, check_pair, in_range, plain_ssim
 
 
 def apply_mask(image: Tensor, mask: Tensor | None) -> Tensor:
@@ -77,7 +77,7 @@ def photometric_loss(
         if not psnr:
             return mean_of_kept(photometric_loss(*masked, dssim_weight), mask)
         # Only 1 - SSIM is a mean over the pixels; the logarithm of one has the same slope over all of them.
-        scaled = dssim_weight / max(float(mask.float().mean()), LEAST_ERROR)
+        scaled = dssim_weight / max(float(mask.float().mean()), MIN_ERROR)
         total = scaled + 1 - dssim_weight
         return total * photometric_loss(*masked, scaled / total, psnr=True)
     if kernels := _kernels(image, target):
@@ -89,7 +89,7 @@ def plain_loss(image: Tensor, target: Tensor, dssim_weight: float, *, psnr: bool
     """The loss of images ``[H, W, 3]`` in plain torch, in the type of the first one."""
     image, target = in_range(image, target)
     difference = image - target
-    error = LOG_WEIGHT * (difference.square().mean() + LEAST_ERROR).log() if psnr else difference.abs().mean()
+    error = LOG_WEIGHT * (difference.square().mean() + MIN_ERROR).log() if psnr else difference.abs().mean()
     return (1 - dssim_weight) * error + dssim_weight * (1 - plain_ssim(image, target))
 
 

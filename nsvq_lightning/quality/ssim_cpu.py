@@ -210,7 +210,7 @@ def fused_loss(
     l1_step, l2_step = error_weight / count, 0.0
     if psnr:
         square_errors(threads, pixels, wanted, white, height, length, pitch, images, lanes, sums)
-        squares = sums[0::2].sum() / count + formulas.LEAST_ERROR
+        squares = sums[0::2].sum() / count + formulas.MIN_ERROR
         l1_step, l2_step = 0.0, 2 * error_weight * formulas.LOG_WEIGHT / (count * squares)
     sweep_image(
         threads, pixels, wanted, white, flat(gradient), height, length, pitch,

@@ -24,7 +24,7 @@ formulas = for_triton(shared)
 
 # The taps of the window, from the middle outwards.
 TAPS, RADIUS = constexpr(tuple(ssim_window()[SSIM_RADIUS:].tolist())), constexpr(SSIM_RADIUS)
-LOG_WEIGHT, LEAST_ERROR = constexpr(shared.LOG_WEIGHT), constexpr(shared.LEAST_ERROR)
+LOG_WEIGHT, MIN_ERROR = constexpr(shared.LOG_WEIGHT), constexpr(shared.MIN_ERROR)
 # Image rows per program: four floats per thread, so that registers suffice for all taps.
 ROWS = 4
 # Floats of each row per program, three to a pixel.
@@ -161,7 +161,7 @@ def loss_kernel(sums, loss, programs, count, dssim_weight, PSNR: constexpr, BLOC
     error = tl.sum(difference, 0) / count
     l1_step, l2_step = (1 - weight) / count, (1 - weight) * 0.0
     if PSNR:
-        error += LEAST_ERROR
+        error += MIN_ERROR
         l1_step, l2_step = l2_step, l1_step * (2 * LOG_WEIGHT) / error
         error = LOG_WEIGHT * tl.log(error)
     value = (1 - weight) * error + weight * (1 - tl.sum(similarity, 0) / count)

@@ -29,7 +29,7 @@ from nsvq_lightning.training.splat_scene import SplatScene
 # nearest camera, as a lone point would hide what is behind it; most points of those that there are, as a multiple of
 # those to start with; share of the photos in which points must lie, as a scanner that reaches a few metres has many
 # points there, and none behind.
-FIRST_OPACITY, MAX_PIXELS, MOST_POINTS, MIN_COVERED = 0.3, 50.0, 8, 0.75
+FIRST_OPACITY, MAX_PIXELS, MAX_POINTS, MIN_COVERED = 0.3, 50.0, 8, 0.75
 # A point is lone whose neighbours are farther than this share of its distance from the nearest camera, and in the way
 # if that distance is below this share of the median: of SfM's points of six scenes, at most 0.16 % are.
 LONE, NEAR_BY = 0.1, 0.3
@@ -208,7 +208,7 @@ def first_splats(trainer: Trainer, sh_degree: int, count: int | None, seed: int)
     scene = replace(scene, points=scene.points[rows], colors=scene.colors[rows], grey=grey)
     if any(source.masked for source in scene.images.sources):
         # What is always masked is not trained, only in the way.
-        scene = scene.thinned(MOST_POINTS * count or len(scene.points))
+        scene = scene.thinned(MAX_POINTS * count or len(scene.points))
         shown = torch.from_numpy(colors_at(scene, scene.points.double().numpy(), 1)[1][:, 0] > 0)
         scene = replace(scene, points=scene.points[shown], colors=scene.colors[shown]) if shown.any() else scene
     is_part = len(scene.points) > count // 2 and scene.covered() < MIN_COVERED
@@ -232,7 +232,7 @@ def _with_dense_points(scene: Scene, count: int, seed: int, least: int = 0) -> t
     points than that, some are taken: splats get their sizes from the distances of these, and most would go.
     """
     fills = scene.grey and not scene.white
-    points, colors = (spread(each, MOST_POINTS * count or len(each)) for each in (scene.points, scene.colors))
+    points, colors = (spread(each, MAX_POINTS * count or len(each)) for each in (scene.points, scene.colors))
     known = 0 if fills else len(points)
     room = max(count - known, least)
     if room <= 0:
