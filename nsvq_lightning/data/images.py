@@ -66,7 +66,7 @@ def image_head(path: Path) -> ImageHead:
             orientation = int(tags.get(Base.Orientation, 1))
             if image.format == "TIFF":  # Pillow applies the orientation to their size
                 size = int(tags[Base.ImageWidth]), int(tags[Base.ImageLength])
-            has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+            has_alpha = image.has_transparency_data
     except DAMAGED as error:
         raise _undecodable(path, str(error)) from error
     return ImageHead(size, orientation, has_alpha)
