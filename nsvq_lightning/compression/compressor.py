@@ -141,6 +141,19 @@ THINNING = 3
 
 
 @dataclass(eq=False)
+class Trainings:
+    """How far the trainings of a scene are, and of its parts, which share this.
+
+    Attributes:
+        stopped: Whether Ctrl-C has ended one before its end.
+        begun: Whether one is done, so that Ctrl-C need not lose all.
+    """
+
+    stopped: bool = False
+    begun: bool = False
+
+
+@dataclass(eq=False)
 class Compressor:
     """Compresses one scene at any setting; each pair of codebooks and number of splats is trained at most once.
 
@@ -155,8 +168,7 @@ class Compressor:
         minutes: What one training may take, about.
         steps: Steps of a training, at least 4; None as many as the minutes allow, at most :data:`USUAL_STEPS`, or
             :data:`THINNING` times as many.
-        stopped: Whether Ctrl-C has ended a training before its end.
-        begun: Whether a training is done, so that Ctrl-C need not lose all.
+        trainings: How far they are.
     """
 
     scene: CompressedScene
@@ -166,8 +178,7 @@ class Compressor:
     seed: int = 0
     minutes: float = math.inf
     steps: int | None = None
-    stopped: bool = field(default=False, init=False)
-    begun: bool = field(default=False, init=False)
+    trainings: Trainings = field(default_factory=Trainings)
 
     def __post_init__(self) -> None:
         self._splats = self.scene.tensors()
@@ -192,6 +203,11 @@ class Compressor:
         # Of settings that are not turned, which needs no training.
         self._trained = cache(self._train)
         self._weights = cache(self._row_weights)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether Ctrl-C has ended a training before its end; further ones take a few steps."""
+        return self.trainings.stopped
 
     @cached_property
     def measure(self) -> viewpoints.Measure:
@@ -369,9 +385,9 @@ class Compressor:
         try:
             return self._train_once(setting)
         except KeyboardInterrupt:
-            if self.stopped or not self.begun:
+            if self.stopped or not self.trainings.begun:
                 raise
-            self.stopped = True
+            self.trainings.stopped = True
         trim()  # now that the error does not hold what has failed
         return self._train_once(setting)
 
@@ -400,23 +416,11 @@ class Compressor:
         if "shN" in sizes and not prune:
             module.splats.shN = torch.nn.Parameter(self._splats.shN, requires_grad=False)
         if sizes or prune or not self._is_own:  # its own pictures teach nothing new
-            phases = cb.PhaseSchedule(
-                total=steps,
-                reference_total=None,
-                min_finetune=1,
-                warmup_end=0,
-                prune_end=prune,
-                quantize_end=prune + 2 * (steps - prune) // 3 if sizes else steps,
-                position_decay=max(1, prune),
-            )
-            budget = cb.SplatBudget(splats=setting.splats)
-            which = [budget, phases, cb.LearningRateDecay(start=prune), cb.SplatSelection(), cb.CanonicalCovariance()]
-            codes = [cb.CodebookInit(), cb.FiniteCodes(), cb.FreezeCodes()]
-            self._fit(module, steps, [*which, *codes, cb.SplatProgressBar()])
+            self._fit(module, steps, _callbacks(setting.splats, steps, prune, bool(sizes)))
         found = replace(module.compressed().finite(), origin=self.scene.origin, cameras=self.scene.cameras)
         del module
         trim()
-        self.begun = True
+        self.trainings.begun = True
         return found
 
     @cached_property
@@ -447,15 +451,11 @@ class Compressor:
             log.info(f"part {number + 1} of {self.parts}")
             part = self.scene.take(rows)
             cameras = viewpoints.showing(self._known, part.means, viewpoints.VIEWS)
-            own = Compressor(part, cameras, None, self.storage, self.seed, self.minutes * len(part) / 1e6, self.steps)
-            own.stopped, own.begun = self.stopped, bool(found)
+            own = replace(self, scene=part, cameras=cameras, photos=None, minutes=self.minutes * len(part) / 1e6)
             left = max(1, setting.splats * len(part) // len(self.scene))
             if left < len(part):  # in its pictures are those that go, too
                 _, own._splats = own.data, own._splats.take(top_rows(self._effects[rows], left))
-            try:
-                found.append(own._train(setting._replace(splats=left)))
-            finally:
-                self.stopped = own.stopped
+            found.append(own._train(setting._replace(splats=left)))
             del own, part
             trim()
         return replace(CompressedScene.joined(found), cameras=self.scene.cameras)
@@ -472,7 +472,7 @@ class Compressor:
         except (KeyboardInterrupt, SystemExit):  # Lightning turns the one into the other
             if module.phase < Phase.QUANTIZE or not all(getattr(q, "fitted", True) for q in module.quantizers.values()):
                 raise KeyboardInterrupt from None
-            self.stopped = True
+            self.trainings.stopped = True
         finally:
             chatter.setLevel(level)
 
@@ -486,6 +486,22 @@ class Compressor:
         """How many steps the minutes are enough for."""
         seconds = iteration_seconds(self.data.scene, [(1.0, len(self.scene))], best_device())
         return int(min(60 * self.minutes / seconds, 1e9))
+
+
+def _callbacks(splats: int, steps: int, prune: int, coded: bool) -> list[Callback]:
+    """What selects splats before the first of the steps, and places and freezes codes after those of pruning."""
+    phases = cb.PhaseSchedule(
+        total=steps,
+        reference_total=None,
+        min_finetune=1,
+        warmup_end=0,
+        prune_end=prune,
+        quantize_end=prune + 2 * (steps - prune) // 3 if coded else steps,
+        position_decay=max(1, prune),
+    )
+    selection = [cb.SplatBudget(splats=splats), phases, cb.LearningRateDecay(start=prune), cb.SplatSelection()]
+    codes = [cb.CanonicalCovariance(), cb.CodebookInit(), cb.FiniteCodes(), cb.FreezeCodes()]
+    return [*selection, *codes, cb.SplatProgressBar()]
 
 
 @torch.inference_mode(False)
