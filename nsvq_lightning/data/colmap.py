@@ -232,6 +232,10 @@ def other_models(root: Path) -> list[str]:
     return sorted(str(folder.relative_to(root)) for folder in folders if _tables_in(folder))
 
 
+# So many points that no two photos saw are taken as they are; a scanner has more.
+MAX_UNSEEN = 1000
+
+
 def read_model(root: Path, observations: bool = False, chosen: str | None = None) -> ColmapModel:
     """Read the model of a scene folder; without ``points3D`` it has no points.
 
@@ -275,7 +279,7 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
         colors=rgb_bytes(points.rgb),
         observations=_observations(rows, points.tracks) if observations else None,
         images_folder=next((str(each.absolute()) for each in beside if each.is_dir()), None),
-        cloud=not points.seen,
+        cloud=not points.seen and len(points.xyz) > MAX_UNSEEN,
     )
 
 
@@ -401,8 +405,7 @@ def alignment(model: ColmapModel, other: ColmapModel) -> Float64s:
     for places in (ours, theirs):
         if len(shared) < 3 or np.linalg.matrix_rank(places - places.mean(0), 1e-6 * np.ptp(places)) < 2:
             raise SceneError(
-                f"{len(shared)} photos of the same name are in both scenes: to align them takes three that were not "
-                "taken from one line"
+                f"{len(shared)} photos of the same name are in both scenes: it takes three, not taken from one line"
             )
     return import_pycolmap().estimate_sim3d(ours, theirs).matrix()  # type: ignore[no-any-return]
 

@@ -35,6 +35,8 @@ from nsvq_lightning.top_level import log
 T = TypeVar("T")
 
 Factor = Literal[1, 2, 4, 8]
+# Indices of views, ascending.
+Rows = tuple[int, ...]
 
 # So many cameras, and so many splats, are asked what cameras show, at most.
 SOME_CAMERAS, SOME_SPLATS = 300, 20_000
@@ -184,8 +186,8 @@ class Scene:
     images: ImageStore
     points: Tensor
     colors: Tensor
-    train: tuple[int, ...]
-    test: tuple[int, ...]
+    train: Rows
+    test: Rows
     extent: float
     frame: Frame = Frame()  # noqa: RUF009  frozen
     split: str = "every 8th by name"
@@ -303,27 +305,8 @@ def load_scene(
     poses = read_poses(root, model, allow_outside=allow_outside)
     if model is None and poses.source == "COLMAP" and (larger := larger_models(root)):
         log.warning(f"{root}: {larger}")
-    views = range(len(poses.images))
-    test = tuple(views[::test_every])
-    split = f"every {test_every}th by name"
-    advice = "register more photos"
-    if poses.test is not None:
-        test = poses.test
-        split = f"as {poses.source} says"
-        advice = "check what it lists"
-    train = tuple(sorted(set(views) - set(test)))
-    if not train or not test:
-        raise SceneError(
-            f"{root}: {len(views)} registered image(s), test views {split}, leave {len(train)} train and {len(test)} "
-            f"test views; at least 1 of each is needed: {advice}"
-        )
     names = [image.name for image in poses.images]
-    last = [re.split(r"\D+", Path(name).stem)[-1] for name in names]
-    if poses.test is None and len({last[view] for view in test}) == 1 < len(test) and len(set(last)) > 1:
-        log.warning(
-            f"all {len(test)} test photos end in {last[test[0]]}, as those of one camera of a rig: what it shows is "
-            f"not trained on; --data.test_every={test_every + 1} takes turns"
-        )
+    train, test, split = _split(root, poses, names, test_every)
     if images_folder in (None, "images"):
         images_folder = poses.images_folder or "images"
     folder, divisor = photo_folder(root, images_folder, factor, names)
@@ -335,36 +318,25 @@ def load_scene(
             "copy the photos that COLMAP was run on into that folder, under the same names"
             f"{', or leave factor out' if divisor == 1 and factor else ''}"
         )
-    mask_files: list[Path | None] = [None] * len(views)
+    mask_files: list[Path | None] = [None] * len(files)
     if masks is not None:
         mask_files = find_masks(poses.images, files, folder, root, [f"{masks}_{factor}", masks] if factor else [masks])
     sources = _image_sources(poses, files, mask_files, divisor, max_width if factor is None else None)
     poses, frame, near = _framed(poses, root, origin)
     cameras = tuple(_camera(image, source.pinhole, near) for image, source in zip(poses.images, sources, strict=True))
+    points, colors, extent = _points(poses, frame)
     grey = poses.colors.size > 0 and not np.ptp(poses.colors)
     if grey:
         log.info(f"the points of {root} have no colours: they start grey, behind those that photos show")
-        poses = replace(poses, colors=np.full_like(poses.colors, 128))
-    centres = np.stack([image.centre for image in poses.images])
-    finite = np.isfinite(poses.points).all(1)
-    usable = finite & ~astray(poses.points, _POINT_ASTRAY)
-    distances, _ = cKDTree(centres).query(poses.points[finite])
-    # What is left of one place by rounding is no parallax.
-    parallax = np.ptp(centres, axis=0).max() > _NO_PARALLAX * np.median(np.append(distances, 0))
-    extent = EXTENT * frame.unit if parallax else 0.0
-    # At a camera's centre a point has no direction; splats there are in no view, or cover that camera's whole view.
-    usable[finite] &= distances > _AT_CAMERA * extent
-    if not usable.all():
-        text = f"left out {np.sum(~usable)} of {len(usable)} points"
-        log.warning(f"{text}: they are at the centre of a camera, or far from all others")
+        colors = torch.full_like(colors, 128 / 255)
     images = ImageStore(sources, cache_bytes)
     scene = Scene(
         root=root,
         names=tuple(names),
         cameras=cameras,
         images=images,
-        points=torch.from_numpy(poses.points[usable]).float(),
-        colors=torch.from_numpy(poses.colors[usable]).float() / 255,
+        points=points,
+        colors=colors,
         train=train,
         test=test,
         extent=extent,
@@ -378,6 +350,54 @@ def load_scene(
         scene = scene.with_random_points()
         log.info(f"{root} has no points: {len(scene.points)} random ones in what the cameras see take their place")
     return scene
+
+
+def _split(root: Path, poses: ColmapModel, names: list[str], test_every: int) -> tuple[Rows, Rows, str]:
+    """Indices of the train and of the test views, and in words which are the latter; warns of those of one camera.
+
+    Raises:
+        SceneError: There is no train or no test view.
+    """
+    views = range(len(names))
+    if poses.test is None:
+        test = tuple(views[::test_every])
+        split = f"every {test_every}th by name"
+        advice = "register more photos"
+        last = [re.split(r"\D+", Path(name).stem)[-1] for name in names]
+        if len(set(last[::test_every])) == 1 < min(len(test), len(set(last))):
+            log.warning(
+                f"all {len(test)} test photos end in {last[0]}, as those of one camera of a rig: what it shows is not "
+                f"trained on; --data.test_every={test_every + 1} takes turns"
+            )
+    else:
+        test = poses.test
+        split = f"as {poses.source} says"
+        advice = "check what it lists"
+    train = tuple(sorted(set(views) - set(test)))
+    if not train or not test:
+        raise SceneError(
+            f"{root}: {len(views)} registered image(s), test views {split}, leave {len(train)} train and {len(test)} "
+            f"test views; at least 1 of each is needed: {advice}"
+        )
+    return train, test, split
+
+
+def _points(poses: ColmapModel, frame: Frame) -> tuple[Tensor, Tensor, float]:
+    """The points that are of use, their colours, and the extent of the cameras; warns of points that are not."""
+    centres = np.stack([image.centre for image in poses.images])
+    finite = np.isfinite(poses.points).all(1)
+    usable = finite & ~astray(poses.points, _POINT_ASTRAY)
+    distances, _ = cKDTree(centres).query(poses.points[finite])
+    # What is left of one place by rounding is no parallax.
+    parallax = np.ptp(centres, axis=0).max() > _NO_PARALLAX * np.median(np.append(distances, 0))
+    extent = EXTENT * frame.unit if parallax else 0.0
+    # At a camera's centre a point has no direction; splats there are in no view, or cover that camera's whole view.
+    usable[finite] &= distances > _AT_CAMERA * extent
+    if not usable.all():
+        text = f"left out {np.sum(~usable)} of {len(usable)} points"
+        log.warning(f"{text}: they are at the centre of a camera, or far from all others")
+    points, colors = (torch.from_numpy(each[usable]).float() for each in (poses.points, poses.colors))
+    return points, colors / 255, extent
 
 
 def _in_front_of_white(images: ImageStore) -> bool:
@@ -448,7 +468,7 @@ def _odd_lens(number: int, lens: Pinhole, size: tuple[int, int]) -> list[str]:
 
 
 def _scaled(lens: Pinhole, divisor: int, max_width: int | None) -> Pinhole:
-    scale = 1 / divisor if max_width is None or lens.width <= max_width else max_width / lens.width
+    scale = min(1 / divisor, (max_width or math.inf) / lens.width)
     return lens.scaled(scale, scale)
 
 

@@ -21,6 +21,7 @@ from moved_scenes import write_moved
 from runs import quiet_trainer
 from transforms_scenes import write_blender, write_nerfstudio
 
+from nsvq_lightning.data import colmap
 from nsvq_lightning.data import scene as scene_module
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_models
 from nsvq_lightning.data.datamodule import ColmapDataModule
@@ -416,8 +417,9 @@ def test_points_that_are_not_where_photos_show_them_make_way(
 
 @pytest.mark.parametrize("track", ["", " 1 0"])
 def test_points_of_a_table_that_no_two_photos_saw_may_be_elsewhere(
-    demo_scene: Path, tmp_path: Path, track: str
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, track: str
 ) -> None:
+    monkeypatch.setattr(colmap, "MAX_UNSEEN", 100)
     for move in ("right", "turned"):
         root = cloud_scene(demo_scene, tmp_path / move, move)
         scene = load_scene(root)
