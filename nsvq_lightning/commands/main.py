@@ -8,12 +8,14 @@ import re
 import signal
 import sys
 import warnings
+from _thread import interrupt_main
 from argparse import ArgumentError, RawDescriptionHelpFormatter
 from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from inspect import cleandoc
 from io import TextIOWrapper
+from threading import Timer
 from traceback import walk_tb
 from typing import Any, TextIO
 
@@ -57,8 +59,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     # A pipe, too, shows lines as they come; on Windows it accepts only the locale's characters.
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="replace", line_buffering=True)
-    if own_process and hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
-        signal.signal(signal.SIGHUP, _hang_up)
+    if own_process:
+        sys.unraisablehook = _once_more
+        if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
+            signal.signal(signal.SIGHUP, _hang_up)
     try:
         if name in OF_LIGHTNING or name.startswith("-"):
             return _run_lightning(arguments, own_process)
@@ -83,6 +87,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.name != "cv2":
             raise
         return _failed("error: OpenCV (cv2) is missing: pip install opencv-contrib-python-headless, or any other")
+
+
+def _once_more(lost: Any) -> None:
+    """Have Ctrl-C come again that was lost in a function that C calls, as LLVM does while kernels are compiled."""
+    if lost.exc_type is KeyboardInterrupt:
+        Timer(0.1, interrupt_main).start()  # not now: it would be lost in here, too
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _hang_up(number: int, frame: Any) -> None:

@@ -186,8 +186,7 @@ SCENE = ["--config=demo", "--callbacks.progress=null"]
         ("--callbacks.density.budget=1", "budget must be at least min_splats=10, got 1"),
         ('--callbacks.density={"class_path": "DensityControl", "init_args": {"max_splats": -1}}', "max_splats must be"),
         ("--callbacks.report.every=-1", "every must be at least 0, got -1"),
-        ("--callbacks.report.every=null", "every must have a value, got None"),
-        ("--ckpt_path=none.ckpt", "none.ckpt: No such file or directory"),
+        ("--callbacks.density.every=null", "every must have a value, got None"),
         ("--trainer.logger=MLFlowLogger", "mlflow"),
         ("--trainer.accelerator=gpu", "No supported gpu backend found"),
         ("--model.quantizer=nn_modules.NoQuantizer", "NoQuantizer is not a quantizer; it lacks: codebook, codes"),
@@ -209,6 +208,37 @@ def test_settings_that_cannot_be_are_one_line(
     assert [line.partition(":")[0] for line in lines] == ["error", "(NSVQ_TRACEBACK=1 shows where)"]
     assert message in lines[0]
     assert sorted(path.name for path in tmp_path.iterdir() if path.name != "__pycache__") == ["nn_modules.py"]
+
+
+def test_a_missing_file_is_named_first(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["fit", *SCENE, "--model.init_from=none.ply", "--trainer.max_steps=1"]) == 1
+    assert "error: none.ply: No such file or directory\n(NSVQ_TRACEBACK=1 shows where)" in capsys.readouterr().err
+
+
+def test_ctrl_c_in_a_function_that_c_calls_comes_again() -> None:
+    said = subprocess.run(
+        [sys.executable, "-c", LOST], capture_output=True, text=True, timeout=120, check=False, env=os.environ
+    )
+    assert (said.returncode, said.stdout.split()) == (130, ["begun"]), said.stderr
+
+
+# As LLVM calls back while kernels are compiled: what is raised in there is ignored.
+LOST = """
+import ctypes, signal, sys, time
+from nsvq_lightning.commands import main as module
+def run(options):
+    print("begun")
+    ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
+    for _ in range(600):
+        time.sleep(0.1)
+    print("lost")
+module.run_command = lambda name, arguments: run(arguments)
+sys.argv = ["nsvq", "info", "x"]
+sys.exit(module.main())
+"""
 
 
 def test_a_bug_in_a_class_of_ones_own_shows_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
