@@ -27,7 +27,8 @@ from PIL.ExifTags import IFD, Base
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
 from nsvq_lightning.data.images import DAMAGED, ImageHead, exif_of, is_transparent, read_image, read_mask, write_pixels
 from nsvq_lightning.data.photo_files import PHOTOS, masks_in, photos_below
-from nsvq_lightning.io.atomic import make_folder_of, write_bytes, write_text
+from nsvq_lightning.io.atomic import make_folder_of, sync, write_bytes, write_text
+from nsvq_lightning.io.errors import as_defect
 from nsvq_lightning.top_level import log
 
 # Photos that are named; of the others, their number is.
@@ -340,6 +341,8 @@ def _map(scene: Path, stamps: dict[str, str], report: Report, threads: int) -> l
         for index, model in enumerate(ordered):
             (work / str(index)).mkdir(parents=True)
             model.write(work / str(index))
+        for file in work.rglob("*.bin"):  # COLMAP flushes none, and the stamps say that they are complete
+            sync(file, os.O_RDWR)
         write_text(work / STAMPS, json.dumps(stamps))
         rmtree(sparse, ignore_errors=True)
         work.rename(sparse)
@@ -377,7 +380,8 @@ def _rows(scene: Path, query: str, *parameters: str) -> list[tuple[Any, ...]]:
     database = scene / DATABASE
     if not database.exists():
         return []
-    with closing(sqlite3.connect(database)) as connection:
+    damaged = f"{database} is damaged, as after a power loss: remove it, and features are found again"
+    with closing(sqlite3.connect(database)) as connection, as_defect(damaged, sqlite3.DatabaseError):
         return connection.execute(query, parameters).fetchall()
 
 

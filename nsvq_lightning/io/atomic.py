@@ -41,7 +41,7 @@ def atomic_path(path: StrPath) -> Iterator[Path]:
     temporary = target.parent / f".{os.getpid()}-{secrets.token_hex(8)}.tmp"
     try:
         yield temporary
-        _sync(temporary, os.O_RDWR)  # not read-only: Windows flushes only files that are open for writing
+        sync(temporary, os.O_RDWR)  # not read-only: Windows flushes only files that are open for writing
         with suppress(OSError):  # no file before, or one where modes cannot be set
             temporary.chmod(target.stat().st_mode & 0o7777)
         os.replace(temporary, target)
@@ -54,7 +54,7 @@ def atomic_path(path: StrPath) -> Iterator[Path]:
         raise
     # Make the new name itself survive a power failure, where the system can open folders.
     with suppress(OSError):
-        _sync(target.parent, os.O_RDONLY)
+        sync(target.parent, os.O_RDONLY)
 
 
 @contextmanager
@@ -116,7 +116,7 @@ def remove_temporaries(folder: Path, process: str) -> None:
             path.unlink(missing_ok=True)
 
 
-def _sync(path: Path, access: int) -> None:
+def sync(path: Path, access: int) -> None:
     """Flush a file or folder to disk."""
     descriptor = os.open(path, access)
     try:

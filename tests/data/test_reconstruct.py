@@ -21,6 +21,7 @@ from nsvq_lightning.data import reconstruct
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap
 from nsvq_lightning.data.images import ImageHead, image_head, read_image
 from nsvq_lightning.data.reconstruct import copy_photos, oddities, photos_in, sharpness, some, stamps_in, write_frames
+from nsvq_lightning.io.errors import FormatError
 
 
 def _texture(shift: int = 0) -> np.ndarray[Any, Any]:
@@ -503,6 +504,12 @@ def test_photos_of_two_cameras_and_unpadded_numbers_are_compared_with_near_ones(
     for name in ("IMG (1).jpg", "#1.jpg"):
         assert _compared(tmp_path, [f"{k}.jpg" for k in range(150)] + [name], monkeypatch) == []
     assert len(sequences) == 2
+
+
+def test_a_damaged_database_is_told(tmp_path: Path) -> None:
+    (tmp_path / reconstruct.DATABASE).write_bytes(b"SQLite format 3" + bytes(4000))
+    with pytest.raises(FormatError, match=r"database\.db is damaged, as after a power loss: remove it"):
+        reconstruct._rows(tmp_path, "select name from images")
 
 
 def test_the_progress_of_comparing_leaves_the_database_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
