@@ -264,6 +264,7 @@ void main() {
 
 const BLEND = `#version 300 es
 precision highp float;
+uniform float lost;  // share of what is behind that a device loses at each splat
 flat in vec4 colour;
 in vec2 offset;
 out vec4 pixel;
@@ -271,8 +272,14 @@ void main() {
   float alpha = colour.a * exp(-0.5 * dot(offset, offset));
   if (alpha < 1.0 / 255.0) discard;
   alpha = min(alpha, 0.99);
-  pixel = vec4(colour.rgb * alpha, alpha);
+  pixel = vec4(colour.rgb * alpha, alpha - lost);
 }`;
+
+/** Takes a ten-thousandth from what is there, less than 16-bit floats tell from 1. */
+const FAINT = `#version 300 es
+precision highp float;
+out vec4 pixel;
+void main() { pixel = vec4(0, 0, 0, 1e-4); }`;
 
 const SHOW = `#version 300 es
 precision highp float;
@@ -307,6 +314,10 @@ class Renderer {
     const trained = config?.antialiased === true ? "antialiased" : cameras.length ? "sampled" : "plain";
     this.splat = this.#program(SPLAT(trained), BLEND, { geometry: 0, colours: 2, order: 4 });
     this.show = this.#program(FULL_SCREEN, SHOW, { picture: 3 });
+    if (fine && this.#cuts()) {
+      gl.useProgram(this.splat.program);
+      gl.uniform1f(this.splat.at.lost, 2 ** -12 / Math.LN2); // half of the last of 11 bits, on average
+    }
     const corners = Uint16Array.from({ length: 6 * GROUP }, (_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 2, 1, 3][k % 6]);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
@@ -394,9 +405,27 @@ class Renderer {
     }
     gl.useProgram(program);
     for (const [name, slot] of Object.entries(samplers)) gl.uniform1i(gl.getUniformLocation(program, name), slot);
-    const names = ["eye", "rotation", "translation", "size", "lens", "slopes", "near", "enlarged", "scale"];
+    const names = ["eye", "rotation", "translation", "size", "lens", "slopes", "near", "enlarged", "scale", "lost"];
     const at = Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]));
     return { program, at };
+  }
+
+  /** Whether this device cuts off what 16-bit floats have no digits for, where others round: Direct3D's rule, and some drivers'. */
+  #cuts() {
+    const gl = this.gl, read = new Float32Array(4), { texture, buffer } = this.#target(3, 1, 1);
+    const { program } = this.#program(FULL_SCREEN, FAINT, {});
+    gl.viewport(0, 0, 1, 1);
+    gl.clearColor(1, 1, 1, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.enable(gl.BLEND);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.disable(gl.BLEND);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.FLOAT, read);
+    gl.deleteFramebuffer(buffer);
+    gl.deleteTexture(texture);
+    gl.deleteProgram(program);
+    return read[0] < 1;
   }
 
   /** Splats from far to near, all or some of them: whole rows. */
@@ -858,13 +887,13 @@ async function main() {
 
   addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target === element("cameras")) return;
-    const name = event.key.toLowerCase();
+    const name = event.key.toLowerCase(), pressed = event.shiftKey ? name.toUpperCase() : name; // whatever Caps Lock says
     if (name in flight) {
       keys.add(name);
       if (!event.repeat) fly(1 / 20); // a slow device may draw nothing before the key is released
       moved();
     } else if (event.repeat) return;
-    else if (event.key in commands) actions[commands[event.key]]();
+    else if (pressed in commands) actions[commands[pressed]]();
     else if (name === "escape") say("");
     else if (name === "h") document.body.classList.toggle("bare");
     else return;
@@ -929,6 +958,7 @@ async function main() {
   addEventListener("hashchange", () => say(follow()));
   canvas.addEventListener("pointerdown", () => say(""));
   element("embed").hidden = server;
+  addEventListener("beforeprint", () => sorted && draw(1)); // or Firefox prints a black canvas
   new ResizeObserver(() => {
     resize();
     if (!sorted) return;
