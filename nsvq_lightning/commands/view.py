@@ -105,7 +105,8 @@ def _nsvq_file(options: Namespace) -> Iterator[Path]:
         return
     with TemporaryDirectory() as folder:
         made = Path(folder) / "scene.nsvq"
-        save(trained_scene(file, options.root), made, "paper")
+        level = read_header(file).level if file.suffix.lower() == ".nsvq" else "paper"  # as small as it is
+        save(trained_scene(file, options.root), made, level)
         yield made
 
 

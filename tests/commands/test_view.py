@@ -205,6 +205,16 @@ def test_any_scene_becomes_one_page(tmp_path: Path, demo_scene: Path, capsys: py
     assert "guess 1" in page.read_text(encoding="utf-8")
 
 
+def test_a_compact_scene_that_gets_cameras_makes_a_page_as_small_as_it_is(tmp_path: Path, demo_scene: Path) -> None:
+    save(random_splats(3000), tmp_path / "scene.nsvq", Storage(level="compact"))
+    page = tmp_path / "page.html"
+    sizes = []
+    for options in ([], ["--data.root", str(demo_scene)]):
+        assert main(["view", str(tmp_path / "scene.nsvq"), "-o", str(page), *options]) == 0
+        sizes.append(page.stat().st_size)
+    assert sizes[1] < 1.05 * sizes[0]
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
