@@ -154,9 +154,9 @@ def _found_views(path: Path, root: Path | None, origin: tuple[float, ...]) -> "V
 
     data = {}
     try:
-        data = {**check_config(str(_run_of(path) / "config.yaml"))["data"]["init_args"]}
-        if root and Path(data["root"]).expanduser().resolve() != root.resolve():
-            data = {}
+        own = {**check_config(str(_run_of(path) / "config.yaml"))["data"]["init_args"]}
+        if not root or Path(own["root"]).expanduser().resolve() == root.resolve():
+            data = own
     except (KeyError, TypeError):  # a config of something else
         pass
     except ValueError as error:

@@ -75,7 +75,7 @@ def _facts(history: Rows, schedule: Schedule, metrics: Values | None) -> dict[st
     last = metrics or history[-1]
     quality = {"test PSNR": _decibels(last["psnr"]), "SSIM": f"{last['ssim']:.4f}"}
     if metrics is None:
-        place = {"iteration": f"{last['iteration']:,} of {schedule.total:,}", "phase": last["phase"]}
+        place = {"iteration": f"{last['iteration']:,} of {schedule.ends[-1]:,}", "phase": last["phase"]}
         return {**place, **quality, "splats": f"{last['splats']:,}", "trained for": _duration(last["seconds"])}
     if metrics["lpips"] is not None:
         quality["LPIPS"] = f"{metrics['lpips']:.4f}"
