@@ -163,8 +163,7 @@ class PhaseSchedule(SplatCallback):
             return
         if step == 0:
             raise ValueError(
-                f"this module was already trained into its {module.phase.name.lower()} phase; make a new one, or pass "
-                "ckpt_path to continue"
+                f"module already trained into its {module.phase.name.lower()} phase; make a new one, or pass ckpt_path"
             )
         raise ValueError(
             f"the module is in its {module.phase.name.lower()} phase, but iteration {step} of a run of "

@@ -156,8 +156,7 @@ def _decoded(path: Path, flags: int) -> Arrays:
         data = path.read_bytes()  # imread fails on names outside the locale's character set
     except OSError as error:
         raise SceneError(
-            f"image {path} cannot be read any more ({error.strerror}): it was there when the scene was loaded; copy it "
-            "there again"
+            f"image {path} cannot be read any more ({error.strerror}): it was there when the scene was loaded"
         ) from error
     try:
         with Image.open(BytesIO(data)) as head:

@@ -88,8 +88,7 @@ def check_kernels(device: torch.device) -> None:
         said = f"{backend} on {name}: relative errors of the kernels: " + written(errors)
         if not all(error < TOLERANCE for error in errors.values()):  # NaN is never below
             raise RuntimeError(
-                f"{said}: this device computes wrong numbers; report this line, and train on the CPU with "
-                "--trainer.accelerator=cpu"
+                f"{said}: this device computes wrong numbers; report this, and train with --trainer.accelerator=cpu"
             )
         log.info(said)
     if record:

@@ -57,8 +57,7 @@ def write_nsvq(path: StrPath, scene: CompressedScene, storage: Storage | None = 
     storage = storage or Storage.told(scene.config)
     if storage.level == "compact" and (culprits := scene.finite_rows()[1]):
         raise ValueError(
-            f"numbers that are not finite ({listed(culprits)}): drop those splats, or use level 'paper', which stores "
-            "float32 as it is"
+            f"numbers that are not finite ({listed(culprits)}): drop those splats, or take level 'paper', which has any"
         )
     with atomic_write(path) as file:
         file.writelines(frame(*encode(scene, storage)))
