@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -429,3 +430,23 @@ def test_bytes_are_kept_to_in_parts_too(monkeypatch: pytest.MonkeyPatch) -> None
     assert whole.parts == 2
     target = int(0.9 * len(whole.at(Setting(450, "0.5k")).data))
     assert len(whole.finest_within(target, 450).data) <= target
+
+
+@pytest.mark.parametrize("at_once", [500, 250])
+def test_ctrl_c_in_a_later_training_loses_none_in_parts_either(monkeypatch: pytest.MonkeyPatch, at_once: int) -> None:
+    monkeypatch.setattr("nsvq_lightning.compression.compressor.AT_ONCE", at_once)
+    scene = ball(450)
+    whole = Compressor(scene, cameras_around(scene.means, 8, 80, 60), steps=4)
+    whole.at(Setting(450, "0.5k"))
+    fit, calls = Compressor._fit, []
+
+    def interrupted(self: Compressor, *args: Any) -> None:
+        calls.append(self)
+        if len(calls) == 1:
+            raise KeyboardInterrupt  # as there are no codes yet
+        fit(self, *args)
+
+    monkeypatch.setattr(Compressor, "_fit", interrupted)
+    assert len(whole.at(Setting(450, "1k")).scene) == 450
+    assert (whole.parts, whole.stopped) == (500 // at_once, True)
+    assert len(calls) == whole.parts + 1
