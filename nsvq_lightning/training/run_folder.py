@@ -161,7 +161,7 @@ def _refuse_other_run(folder: Path, checkpoint: StrPath | None) -> None:
     if checkpoint is None or not Path(checkpoint).resolve().is_relative_to(folder.resolve()):
         raise FileExistsError(
             f"{folder} already holds a run, and no run is overwritten: name another folder or version, or none "
-            "(--trainer.run_folder=null) to take the next free one; --ckpt_path=…/last.ckpt continues it"
+            "(--trainer.run_folder=null) to take the next free one; its --ckpt_path=…/last.ckpt, if any, continues it"
         )
 
 
