@@ -42,7 +42,7 @@ def check_settings(callback: object) -> None:
     for name, hint in get_type_hints(type(callback), include_extras=True).items():
         value = getattr(callback, name, None)
         kinds = hint, *get_args(hint)  # of ``Count | None``, each
-        if value is None and type(None) not in kinds and hasattr(callback, name):
+        if value is None and getattr(type(callback), name, None) is not None and type(None) not in kinds:
             raise ValueError(f"{name} must have a value, got None")
         for kind in kinds:
             for bound in getattr(kind, "__metadata__", ()):

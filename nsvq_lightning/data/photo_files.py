@@ -12,6 +12,9 @@ from nsvq_lightning.top_level import log
 
 # Suffixes of photos that both COLMAP and this package read.
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+# Suffixes of photos that are converted if Pillow reads them, and of raw files.
+CONVERTED = (".jfif", ".jpe", ".avif", ".heic", ".heif", ".hif", ".jxl", ".jp2", ".gif")
+RAW = (".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2", ".srw", ".gpr", ".pef")
 
 # What names of folders of masks have in them.
 _OF_MASKS = re.compile("(?<!un)mask", re.IGNORECASE)
@@ -51,7 +54,7 @@ def locate(
     files = _Files(folder, free, whole=bool(exact))
     used: dict[Path, str] = {}
     for name in sorted(paths.keys() - exact):
-        fitting = files.nearest(name) or files.nearest(name.rpartition(".")[0])  # HEIC and raw ones, converted
+        fitting = files.nearest(name) or files.nearest(_stem(name, CONVERTED + RAW))  # what it was converted to
         if not fitting:
             check_name(name, source, allow_outside)
             continue
@@ -109,10 +112,10 @@ def _key(name: str) -> str:
     return normalize("NFC", name.replace("\\", "/")).casefold()
 
 
-def _stem(name: str) -> str:
-    """A path without the suffix of a photo."""
+def _stem(name: str, suffixes: Sequence[str] = PHOTOS) -> str:
+    """A path without one of the suffixes."""
     stem, dot, suffix = name.rpartition(".")
-    return stem if dot + suffix.lower() in PHOTOS else name
+    return stem if dot + suffix.lower() in suffixes else name
 
 
 def _kind(name: str) -> str:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
-from typing import Annotated, Generic, TypeVar
+from dataclasses import field, fields, is_dataclass
+from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 import pytest
 from jsonargparse import set_parsing_settings
@@ -27,6 +27,14 @@ class Mine(SplatCallback):
     share: Share = 0.0
     factor: Factor = 1.0
     even: Annotated[int, Bound("even", lambda value: value % 2 == 0)] = 0
+
+
+class Unset(SplatCallback):
+    """What is None by the class itself may be None, whatever its type."""
+
+    anything: Any = None
+    reached: int = field(default=None, init=False)  # type: ignore[assignment]
+    shared: ClassVar[int] = None  # type: ignore[assignment]
 
 
 class Derived(Mine):
@@ -100,3 +108,10 @@ def test_every_setting_has_its_sentence_in_the_help(name: str) -> None:
         assert {lines[number].partition("=")[0] for number in options} == {f"  --x.{each}" for each in settings}
     for number in options:
         assert lines[number + 1].startswith(" " * 8), lines[number]
+
+
+def test_none_is_refused_where_a_setting_has_a_value() -> None:
+    assert Unset().anything is None
+    assert Mine(whole=None).whole is None
+    with pytest.raises(ValueError, match="count must have a value, got None"):
+        Mine(count=None)  # type: ignore[arg-type]

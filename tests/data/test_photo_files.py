@@ -84,6 +84,12 @@ def test_a_depth_map_is_not_taken_for_a_photo_that_is_gone(tmp_path: Path, suffi
     assert locate(["1.jpg", "2.jpg"], tmp_path / "scaled", "the model")["2.jpg"] == tmp_path / "scaled/2.png"
 
 
+@pytest.mark.parametrize(("name", "file"), [("img.0001", "img.jpg"), ("scan.v1/2", "scan.jpg"), ("1.HEIC", "2.jpg")])
+def test_what_is_no_suffix_is_part_of_a_name(tmp_path: Path, name: str, file: str) -> None:
+    write(tmp_path, file)
+    assert not locate([name], tmp_path, "the model")[name].exists()
+
+
 def test_maps_are_not_taken_for_photos_that_are_gone(tmp_path: Path) -> None:
     write(tmp_path, "depths/1.png", "depths/2.png", "my_masks/1.png", "normals/1.png")
     for name in ("images/1.png", "1.png"):
