@@ -26,7 +26,7 @@ from PIL.ExifTags import IFD, Base
 
 from nsvq_lightning.data.colmap import SceneError, check_name, import_pycolmap
 from nsvq_lightning.data.images import DAMAGED, ImageHead, exif_of, is_transparent, read_image, read_mask, write_pixels
-from nsvq_lightning.data.photo_files import PHOTOS, masks_in, photos_below
+from nsvq_lightning.data.photo_files import CONVERTED, PHOTOS, RAW, masks_in, photos_below
 from nsvq_lightning.io.atomic import make_folder_of, sync, write_bytes, write_text
 from nsvq_lightning.io.errors import as_defect
 from nsvq_lightning.top_level import log
@@ -380,14 +380,11 @@ def _rows(scene: Path, query: str, *parameters: str) -> list[tuple[Any, ...]]:
     database = scene / DATABASE
     if not database.exists():
         return []
-    damaged = f"{database} is damaged, as after a power loss: remove it, and features are found again"
-    with closing(sqlite3.connect(database)) as connection, as_defect(damaged, sqlite3.DatabaseError):
+    remedy = "if it is damaged, as after a power loss, remove it: features are found again"
+    with closing(sqlite3.connect(database)) as connection, as_defect(str(database), sqlite3.DatabaseError, remedy):
         return connection.execute(query, parameters).fetchall()
 
 
-# Suffixes of photos that are converted if Pillow reads them, and of raw files.
-CONVERTED = (".jfif", ".jpe", ".avif", ".heic", ".heif", ".hif", ".jxl", ".jp2", ".gif")
-RAW = (".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2", ".srw", ".gpr", ".pef")
 # Suffixes of videos.
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
 # Names of folders that hold something else than photos, or the same photos again, and of files that are such.

@@ -508,7 +508,8 @@ def test_photos_of_two_cameras_and_unpadded_numbers_are_compared_with_near_ones(
 
 def test_a_damaged_database_is_told(tmp_path: Path) -> None:
     (tmp_path / reconstruct.DATABASE).write_bytes(b"SQLite format 3" + bytes(4000))
-    with pytest.raises(FormatError, match=r"database\.db is damaged, as after a power loss: remove it"):
+    told = r"database\.db \(file is not a database\); if it is damaged, as after a power loss, remove it"
+    with pytest.raises(FormatError, match=told):
         reconstruct._rows(tmp_path, "select name from images")
 
 
