@@ -97,6 +97,7 @@ def _nsvq_file(options: Namespace) -> Iterator[Path]:
     """The scene that is meant, as a ``.nsvq`` file; that of a running fit is yet to come."""
     from nsvq_lightning.io.formats import save
     from nsvq_lightning.io.nsvq.header import read_header
+    from nsvq_lightning.io.nsvq.precision import Storage
 
     file = options.scene / "scene.nsvq" if options.live else scene_file(options.scene)
     # What has no cameras gets those of --data.root.
@@ -105,8 +106,9 @@ def _nsvq_file(options: Namespace) -> Iterator[Path]:
         return
     with TemporaryDirectory() as folder:
         made = Path(folder) / "scene.nsvq"
-        level = read_header(file).level if file.suffix.lower() == ".nsvq" else "paper"  # as small as it is
-        save(trained_scene(file, options.root), made, level)
+        scene = trained_scene(file, options.root)
+        level = read_header(file).level if file.suffix.lower() == ".nsvq" else "paper"
+        save(scene, made, Storage(level, Storage.told(scene.config).precision))  # as small, and as exact, as it is
         yield made
 
 

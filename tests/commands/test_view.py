@@ -22,7 +22,7 @@ from nsvq_lightning.commands.view import _Handler, _is_own, _Server
 from nsvq_lightning.data.scene import load_scene
 from nsvq_lightning.io import read_nsvq, save
 from nsvq_lightning.io.compressed import CompressedScene
-from nsvq_lightning.io.nsvq.precision import Storage
+from nsvq_lightning.io.nsvq.precision import Precision, Storage
 from nsvq_lightning.rendering.camera import Camera
 from nsvq_lightning.report import viewer
 
@@ -205,14 +205,18 @@ def test_any_scene_becomes_one_page(tmp_path: Path, demo_scene: Path, capsys: py
     assert "guess 1" in page.read_text(encoding="utf-8")
 
 
-def test_a_compact_scene_that_gets_cameras_makes_a_page_as_small_as_it_is(tmp_path: Path, demo_scene: Path) -> None:
-    save(random_splats(3000), tmp_path / "scene.nsvq", Storage(level="compact"))
+@pytest.mark.parametrize("finer", [1, 16])
+def test_a_compact_scene_that_gets_cameras_makes_a_page_as_small_as_it_is(
+    tmp_path: Path, demo_scene: Path, finer: int
+) -> None:
+    precision = Precision(**{name: value / finer for name, value in vars(Precision()).items()})
+    save(random_splats(3000), tmp_path / "scene.nsvq", Storage("compact", precision))
     page = tmp_path / "page.html"
     sizes = []
     for options in ([], ["--data.root", str(demo_scene)]):
         assert main(["view", str(tmp_path / "scene.nsvq"), "-o", str(page), *options]) == 0
         sizes.append(page.stat().st_size)
-    assert sizes[1] < 1.05 * sizes[0]
+    assert sizes[1] == pytest.approx(sizes[0], rel=0.03)
 
 
 @pytest.mark.parametrize(
