@@ -11,6 +11,7 @@ import warnings
 from _thread import interrupt_main
 from argparse import ArgumentError, RawDescriptionHelpFormatter
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from inspect import cleandoc
@@ -92,7 +93,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _once_more(lost: Any) -> None:
     """Have Ctrl-C come again that was lost in a function that C calls, as LLVM does while kernels are compiled."""
     if lost.exc_type is KeyboardInterrupt:
-        Timer(0.1, interrupt_main).start()  # not now: it would be lost in here, too
+        with suppress(RuntimeError):  # a process that ends begins no thread
+            Timer(0.1, interrupt_main).start()  # not now: it would be lost in here, too
     else:
         sys.__unraisablehook__(lost)
 
