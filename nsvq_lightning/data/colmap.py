@@ -323,8 +323,7 @@ def _viewmats(rows: Sequence[tables.ImageRow], path: Path) -> Float64s:
     for one, other in pairwise(rows):
         if one.name == other.name:
             raise SceneError(
-                f"{path} lists {one.name} twice, as images {one.number} and {other.number}: give photos names of their "
-                "own, and run COLMAP again"
+                f"{path} lists {one.name} twice, as images {one.number} and {other.number}: rename one; run COLMAP anew"
             )
     worst = np.abs(norms - 1).max()
     if worst > _ROUNDED:

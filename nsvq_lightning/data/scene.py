@@ -431,7 +431,7 @@ def _image_sources(
         heads = [head_for(*each, as_shown=True) for each in sized]
         turned = sum(head.orientation != 1 for head in heads)
         log.info(f"{turned} of {len(heads)} photos are turned by their EXIF orientation, as their cameras are")
-    elif lying := sum(head_for(path, size[::-1], as_shown=True).orientation > 1 for path, size in sized):
+    elif lying := sum(head_for(path, size[::-1], as_shown=True).orientation != 1 for path, size in sized):
         log.warning(f"{lying} photos are stored on their side, so the scene is: nsvq prepare turns what is elsewhere")
     if others := sum(is_cut(head.size, size) for head, (_, size) in zip(heads, sized, strict=True)):
         log.warning(f"{others} of {len(heads)} photos {OTHER_SHAPE}")

@@ -61,8 +61,7 @@ class Undistortion:
         except (ValueError, RuntimeError) as error:
             remedy = PANORAMA if camera.model_name == "EQUIRECTANGULAR" else "undistort the images with COLMAP first"
             raise SceneError(
-                f"camera {camera.camera_id} with model {camera.model_name} cannot be turned into a pinhole camera "
-                f"({error}): {remedy}"
+                f"camera {camera.camera_id}: {camera.model_name} cannot be turned into a pinhole ({error}): {remedy}"
             ) from error
         self._camera = camera
         self.size = (width, height)

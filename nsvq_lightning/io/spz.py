@@ -148,7 +148,8 @@ def _unpack(data: bytes) -> tuple[SpzHeader, dict[str, bytes]]:
     """Header and arrays of version 4; the streams fill the rest of the file."""
     header = _parse(data[: _HEADER.size], len(data))
     if header.version < 4 or len(data) < _HEAD:
-        raise FormatError(f"truncated or damaged: version {header.version} in {len(data)} bytes without gzip")
+        defect = f"truncated or damaged: version {header.version} in {len(data)} bytes without gzip"
+        raise FormatError(defect, "gzip it, if a browser has unzipped it")
     streams = data[_HEADER.size - 1]
     (offset,) = _TABLE_OFFSET.unpack_from(data, _HEADER.size)
     if streams != len(header.streams):
