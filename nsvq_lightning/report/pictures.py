@@ -123,7 +123,7 @@ def video_writer(path: Path, width: int, height: int, fps: float) -> Iterator[Ca
     program = shutil.which("ffmpeg")
     log.info(f"{path}: {'H.264' if program else 'VP9'}")
     # Both programs tell the container by the suffix, which the unfinished file does not have.
-    with atomic_path(path) as unfinished, tempfile.TemporaryDirectory(dir=unfinished.parent) as folder:
+    with atomic_path(path) as unfinished, tempfile.TemporaryDirectory(dir=unfinished.parent, prefix=".") as folder:
         file = Path(folder) / f"video{VIDEO}"
         first = file.with_suffix(".avi") if program else file  # from which ffmpeg makes the other
         code = "FFV1" if program else "vp09"
