@@ -100,15 +100,16 @@ def _nsvq_file(options: Namespace) -> Iterator[Path]:
     from nsvq_lightning.io.nsvq.precision import Storage
 
     file = options.scene / "scene.nsvq" if options.live else scene_file(options.scene)
+    header = read_header(file) if file.suffix.lower() == ".nsvq" and not options.live else None
     # What has no cameras gets those of --data.root.
-    if options.live or (file.suffix.lower() == ".nsvq" and (options.root is None or read_header(file).cameras)):
+    if options.live or (header and (options.root is None or header.cameras)):
         yield file
         return
     with TemporaryDirectory() as folder:
         made = Path(folder) / "scene.nsvq"
         scene = trained_scene(file, options.root)
-        level = read_header(file).level if file.suffix.lower() == ".nsvq" else "paper"
-        save(scene, made, Storage(level, Storage.told(scene.config).precision))  # as small, and as exact, as it is
+        # As small, and as exact, as it is.
+        save(scene, made, Storage(header.level if header else "paper", Storage.told(scene.config).precision))
         yield made
 
 
