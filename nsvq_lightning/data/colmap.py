@@ -404,7 +404,7 @@ def alignment(model: ColmapModel, other: ColmapModel) -> Float64s:
     for places in (ours, theirs):
         if len(shared) < 3 or np.linalg.matrix_rank(places - places.mean(0), 1e-6 * np.ptp(places)) < 2:
             raise SceneError(
-                f"{len(shared)} photos of the same name are in both scenes: it takes three, not taken from one line"
+                f"{len(shared)} photos of the same name are in both scenes: aligning takes three, not all on one line"
             )
     return import_pycolmap().estimate_sim3d(ours, theirs).matrix()  # type: ignore[no-any-return]
 

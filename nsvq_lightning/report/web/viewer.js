@@ -410,7 +410,7 @@ class Renderer {
     return { program, at };
   }
 
-  /** Whether this device cuts off what 16-bit floats have no digits for, where others round: Direct3D's rule, and some drivers'. */
+  /** Whether this device cuts off what 16-bit floats have no digits for, where others round: Direct3D may, and some drivers do. */
   #cuts() {
     const gl = this.gl, read = new Float32Array(4), { texture, buffer } = this.#target(3, 1, 1);
     const { program } = this.#program(FULL_SCREEN, FAINT, {});
