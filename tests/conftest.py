@@ -77,14 +77,14 @@ def log_level() -> Iterator[None]:
     log.setLevel(level)
 
 
-WHOLE_RUNS = {"benchmark", "training", "runs"}
+WHOLE_RUNS = {"benchmark", "commands", "compression", "training", "runs"}
 """Folders whose tests train: ``properties/runs/test_skips.py`` does so for all of them between guard words."""
 
 
 @pytest.fixture(autouse=True)
 def guard_words(request: pytest.FixtureRequest) -> Iterator[None]:
-    """In every test of kernels and what calls them, kernels work between guard words."""
-    if request.path.parent.name in WHOLE_RUNS:
+    """In tests of kernels and what calls them, kernels work between guard words, but for the mark ``unguarded``."""
+    if request.path.parent.name in WHOLE_RUNS or request.node.get_closest_marker("unguarded"):
         yield
         return
     with guarded():

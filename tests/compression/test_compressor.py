@@ -322,10 +322,11 @@ def replace_position(camera: nl.Camera) -> nl.Camera:
 
 def test_anti_aliasing_is_that_of_a_scene_or_as_said() -> None:
     scene = ball(100)
+    cameras = cameras_around(scene.means, 8, 80, 60)
     for splats, said in ((scene, True), (scene.tensors(), True), (scene, False)):
-        assert nl.compress(splats, antialiased=said, steps=4).antialiased is said
+        assert nl.compress(splats, cameras, antialiased=said, steps=4).antialiased is said
     own = replace(scene, config={**scene.config, "antialiased": True})
-    assert nl.compress(own, steps=4).antialiased
+    assert nl.compress(own, cameras, steps=4).antialiased
 
 
 def test_of_files_within_a_limit_the_best_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
