@@ -62,8 +62,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="replace", line_buffering=True)
     if own_process:
         sys.unraisablehook = _once_more
-        if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
-            signal.signal(signal.SIGHUP, _hang_up)
+        for number in (signal.SIGHUP, signal.SIGUSR1) if hasattr(signal, "SIGHUP") else ():
+            if signal.getsignal(number) == signal.SIG_DFL:
+                signal.signal(number, _hang_up)
     try:
         if name in OF_LIGHTNING or name.startswith("-"):
             return _run_lightning(arguments, own_process)
@@ -100,7 +101,7 @@ def _once_more(lost: Any) -> None:
 
 
 def _hang_up(number: int, frame: Any) -> None:
-    """Stop, as a terminal was closed, which shell and system may both say."""
+    """Stop: a terminal was closed, which shell and system may both say, or the time of a SLURM job is nearly over."""
     signal.signal(number, signal.SIG_IGN)
     signal.raise_signal(signal.SIGTERM)
 

@@ -7,6 +7,7 @@ from typing import Any
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch import Trainer
 from lightning.pytorch.strategies import DDPStrategy
+from lightning.pytorch.utilities import rank_zero_only
 
 from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.io.atomic import make_folder_of
@@ -56,6 +57,13 @@ class SplatTrainer(Trainer):
         super().__init__(*args, **kwargs)
         if kwargs.get("strategy", "auto") == "auto" and isinstance(self.strategy, DDPStrategy):
             super().__init__(*args, **(kwargs | {"strategy": several}))
+        # Not that of a launcher whose processes each train alone: they would log nothing.
+        rank_zero_only.rank = self.global_rank  # type: ignore[attr-defined]
+        # SLURM's would write a checkpoint in the middle of an iteration, and every later run would begin from it.
+        environment: Any = self._accelerator_connector.cluster_environment
+        environment.auto_requeue = False
+        if (others := environment.world_size()) > self.world_size:
+            log.warning(f"each of {others} processes trains the whole scene: set devices to share it")
         self.run_folder, self.allow_other_scene = run_folder, allow_other_scene
         if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # Lightning's own
             self.strategy.checkpoint_io = PlainCheckpointIO()

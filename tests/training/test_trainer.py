@@ -15,6 +15,7 @@ from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.accelerators import CUDAAccelerator, MPSAccelerator
 from lightning.pytorch.callbacks import ModelPruning, StochasticWeightAveraging, WeightAveraging
 from lightning.pytorch.trainer.connectors import accelerator_connector
+from lightning.pytorch.utilities import rank_zero_only
 from splat_scenes import random_splats
 
 from nsvq_lightning.callbacks import ExportScene, PhaseSchedule
@@ -126,3 +127,32 @@ def test_epochs_that_end_nothing_are_told(tmp_path: Path, caplog: pytest.LogCapt
     assert "max_epochs" not in caplog.text
     SplatTrainer(max_epochs=3, max_steps=100, accelerator="cpu", default_root_dir=tmp_path)
     assert "max_epochs ends nothing" in caplog.text
+
+
+def test_a_job_of_slurm_writes_no_checkpoint_that_other_runs_begin_from(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name in ("PROCID", "LOCALID", "NODEID"):
+        monkeypatch.setenv(f"SLURM_{name}", "0")
+    monkeypatch.setenv("SLURM_NTASKS", "1")
+    environment = SplatTrainer(accelerator="cpu", default_root_dir=tmp_path)._accelerator_connector.cluster_environment
+    assert environment.auto_requeue is False
+
+
+def test_a_process_that_trains_alone_logs_whatever_its_launcher_calls_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(rank_zero_only, "rank", 1)
+    SplatTrainer(default_root_dir=tmp_path)
+    assert rank_zero_only.rank == 0
+
+
+def test_processes_that_each_train_the_whole_scene_are_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    SplatTrainer(accelerator="cpu", default_root_dir=tmp_path)
+    assert "processes" not in caplog.text
+    for name, value in {"TORCHELASTIC_RUN_ID": "x", "WORLD_SIZE": "3", "RANK": "1", "LOCAL_RANK": "1"}.items():
+        monkeypatch.setenv(name, value)
+    SplatTrainer(accelerator="cpu", default_root_dir=tmp_path)
+    assert "each of 3 processes trains the whole scene" in caplog.text
