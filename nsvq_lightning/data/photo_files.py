@@ -145,6 +145,7 @@ def photo_folder(root: Path, name: str, factor: int | None, names: Sequence[str]
     divisor = 1 if name.endswith(f"_{factor}") else factor or 1
     scaled = root / f"{name}_{factor}"
     if factor and factor > 1 and scaled.is_dir():
+        log.info(f"photos are read from {scaled}, as they are")
         return scaled, 1
     if (root / name).is_dir():
         return root / name, divisor

@@ -246,6 +246,8 @@ _POINT_ASTRAY = 100
 _AT_CAMERA = 1e-6
 # Cameras that are so near to each other, over the distance of points from them, are in one place.
 _NO_PARALLAX = 1e-4
+# So few points of a model are taken as they are.
+_FEW_POINTS = 1000
 ONE_PLACE = "are taken from one place, or points are in other coordinates: no depth shows; move while taking photos"
 
 
@@ -570,8 +572,11 @@ def uneven(scene: Scene) -> str:
 
 
 def is_elsewhere(scene: Scene) -> bool:
-    """Whether the points of another file are not where the photos show them, as colours tell; intensities do not."""
-    if not (scene.cloud and scene.colors.diff().any()):
+    """Whether points are not where the photos show them, as colours tell; intensities do not.
+
+    Few points are taken as they are, unless they are of another file than the cameras.
+    """
+    if not (scene.cloud or len(scene.points) > _FEW_POINTS) or not scene.colors.diff().any():
         return False
     sums, photos, _ = colors_at(scene, spread(scene.points, SOME_SPLATS).double().numpy(), 5, of_near=True)
     rows = np.flatnonzero(photos)
@@ -584,14 +589,14 @@ def is_elsewhere(scene: Scene) -> bool:
 # What is wrong with them then.
 ELSEWHERE = (
     "are not where the photos show their colours: they are in other coordinates than the cameras; export both from one "
-    "program, in one unit and with the same axes"
+    "program, in one unit and with the same axes, poses from world to camera and quaternions wxyz"
 )
 
 
 def usable(scene: Scene) -> Scene:
     """The scene without the train and test views of which there is no picture (:func:`each_photo`); warns of them.
 
-    Points that are elsewhere (:func:`is_elsewhere`) make way for random ones.
+    Points of another file that are elsewhere (:func:`is_elsewhere`) make way for random ones; warns of others.
 
     Raises:
         SceneError: No train or no test view is left.
@@ -604,8 +609,9 @@ def usable(scene: Scene) -> Scene:
         log.warning(f"left out {len(wrong)} of {len(scene)} photos, first: {first}")
         scene = replace(scene, train=train, test=test)
     if is_elsewhere(scene):
-        log.warning(f"the points of {scene.root} {ELSEWHERE}; random ones take their place")
-        return replace(scene.with_random_points(), extent=EXTENT * scene.frame.unit)
+        log.warning(f"the points of {scene.root} {ELSEWHERE}{'; random ones take their place' * scene.cloud}")
+        if scene.cloud:
+            return replace(scene.with_random_points(), extent=EXTENT * scene.frame.unit)
     return scene
 
 

@@ -35,10 +35,13 @@ def slices(count: int) -> "Iterator[slice]":
         yield slice(start, start + splat.ROWS)
 
 
-def warn_of_activations(logits: Arrays) -> None:
-    """Warn where opacities of any shape, which should be logits, look like activations."""
-    if logits.size and 0 <= logits.min() < logits.max() <= 1:
-        log.warning("all opacities are in [0, 1]: logits are expected, and logarithms of scales")
+def warn_of_activations(logits: Arrays, scales: Arrays) -> None:
+    """Warn where opacities of any shape, which should be logits, or scales ``[N, 2 or more]``, logarithms, are none.
+
+    Of surfels, the third scale is small.
+    """
+    if logits.size and (0 <= logits.min() < logits.max() <= 1 or scales[:, :2].min() > 0):
+        log.warning("all scales above 0, or all opacities are in [0, 1]: logits are expected, and logarithms of scales")
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +153,7 @@ class CompressedScene:
             raise ValueError(f"the splats have no {', '.join(sorted(missing))}")
         if "features_dc" in given and not rows.get("shN", rows["sh0"]).size:  # nerfstudio's of degree 0: logits
             rows["sh0"] = 0.5 * np.tanh(0.5 * rows["sh0"]) / conventions.SH_C0
-        warn_of_activations(rows["opacities"])
+        warn_of_activations(rows["opacities"], rows["scales"])
         return cls.from_rows(rows, **header)
 
     @classmethod

@@ -330,7 +330,7 @@ def _read_plain(path: StrPath, header: PlyHeader, sh_degree: int) -> dict[str, A
         wider = np.log(np.hypot(np.exp(rows["scales"]), widths))
         kept = np.exp((rows["scales"] - wider).sum(1, keepdims=True))
         rows |= {"scales": wider, "opacities": logits_of(kept * opacity_of(rows["opacities"]))}
-    warn_of_activations(rows["opacities"])
+    warn_of_activations(rows["opacities"], rows["scales"])
     return rows
 
 
@@ -428,8 +428,7 @@ def write_ply(path: StrPath, scene: CompressedScene) -> int:
             columns = {name: part.rows(name) for name in ATTRIBUTES}
             columns["shN"] = _by_color(columns["shN"])
             columns["unused"] = np.zeros((len(part), len(_UNUSED)), np.float32)
-            table = np.concatenate([columns[name] for name in _ORDER], axis=1)
-            file.write(np.asarray(table, "<f4").tobytes())
+            file.write(np.concatenate([columns[name] for name in _ORDER], axis=1, dtype="<f4").tobytes())
         return file.tell()
 
 

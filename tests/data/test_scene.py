@@ -433,6 +433,20 @@ def test_points_of_a_table_that_no_two_photos_saw_may_be_elsewhere(
         assert (scene.cloud, scene.grey, is_elsewhere(scene)) == (True, False, move == "turned")
 
 
+def test_poses_that_do_not_show_the_points_of_their_model_are_told(
+    demo_scene: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    right = load_scene(demo_scene)
+    wrong = replace(right, points=right.points * torch.tensor([1.0, -1, -1]))
+    assert usable(wrong) is wrong  # they are few
+    monkeypatch.setattr("nsvq_lightning.data.scene._FEW_POINTS", len(right.points) - 1)
+    assert usable(right) is right
+    assert "show their colours" not in caplog.text
+    assert usable(wrong) is wrong
+    assert "poses from world to camera and quaternions wxyz" in caplog.text
+    assert "random ones" not in caplog.text
+
+
 def test_points_are_taken_where_nothing_says_that_they_are_wrong(demo_scene: Path, tmp_path: Path) -> None:
     for contrast, colourless in ((0.0, True), (100.0, False)):
         scene = load_scene(cloud_scene(demo_scene, tmp_path / str(contrast), "turned", contrast))

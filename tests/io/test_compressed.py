@@ -69,6 +69,9 @@ def test_activations_instead_of_logits_are_told(caplog: pytest.LogCaptureFixture
     rows = plain_scene(20, 1).tensors()._asdict()
     CompressedScene.from_splats(rows)
     assert not caplog.text
+    CompressedScene.from_splats(rows | {"scales": rows["scales"].exp()})
+    assert "all scales above 0, or" in caplog.text
+    caplog.clear()
     CompressedScene.from_splats(rows | {"opacities": rows["opacities"].sigmoid()})
     assert "all opacities are in [0, 1]: logits are expected" in caplog.text
 
