@@ -75,8 +75,7 @@ def run(options: Namespace) -> None:
     if not output.parent.is_dir() and formats.suffix_of(output) != lod.NAME:
         raise FileNotFoundError(f"cannot write {output}: the folder {output.parent} does not exist; create it first")
     # Other formats keep no cameras.
-    root = options.root
-    read = [trained_scene(path, root) if entry.native else formats.read_scene(path) for path in options.inputs]
+    read = [trained_scene(path, options.root) if entry.native else formats.read_scene(path) for path in options.inputs]
     scene = _edited(CompressedScene.joined(read), options)
     writer = {"palette": options.palette, "version": options.spz_version, "axes": options.spz_axes}
     given = {name: value for name, value in writer.items() if value is not None}

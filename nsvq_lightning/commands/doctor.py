@@ -301,8 +301,7 @@ def check_scene(root: Path, model: "ColmapModel") -> Findings:
         if 2 * shown < len(seen):
             text = f"{1 - shown / len(seen):.0%} of the points are not in the pictures that they were found in"
             yield Finding("problem", "poses", f"{text}: are poses camera to world, or quaternions xyzw?")
-    cameras = [model.cameras[image.camera_id] for image in model.images]
-    pairs = zip(cameras, scene.images.sources, strict=True)
+    pairs = zip((model.cameras[image.camera_id] for image in model.images), scene.images.sources, strict=True)
     if others := sum(is_cut(source.size, (camera.width, camera.height)) for camera, source in pairs):
         yield Finding("problem", "sizes", f"{others} of {len(scene)} files {OTHER_SHAPE}")
     yield from attempt("photos", check_photos(scene, model))

@@ -59,7 +59,7 @@ class _Compilations(event.Listener):
         if not self.levels:
             self.since = perf_counter()
             if self.seconds == 0:
-                kept = kernel_cache.kernel_folder() or "no folder"
+                kept = kernel_cache.kernel_folder() or "no folder (NUMBA_CACHE_DIR names one)"
                 log.info(f"compiling kernels, kept in {kept}: a quarter of a minute to one")
         level = numba.config.OPT
         self.levels.append(level)

@@ -66,8 +66,7 @@ def _spread(context, builder, kind, _, value):
 
 def _operator(symbol, result, parameters, emit):
     """Define the operator ``symbol`` for vectors; ``emit(builder, *values)`` builds the instructions."""
-    cases = [signature(result, *parameters)]
-    infer_global(symbol)(type(f"_{symbol.__name__}", (ConcreteTemplate,), {"cases": cases}))
+    infer_global(symbol)(type(symbol.__name__, (ConcreteTemplate,), {"cases": [signature(result, *parameters)]}))
     lower_builtin(symbol, *parameters)(lambda context, builder, sig, values: emit(builder, *values))
 
 

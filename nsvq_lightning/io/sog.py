@@ -104,8 +104,7 @@ def sog_contents(scene: CompressedScene, palette: int) -> dict[str, bytes]:
             "shN_centroids.webp": _picture(indices.reshape(-1, 3), shape),
             "shN_labels.webp": _picture(_low_and_high(labels)),
         }
-        files = list(sh_pictures)
-        meta["shN"] = {"count": len(rows), "bands": scene.sh_degree, "codebook": levels, "files": files}
+        meta["shN"] = {"count": len(rows), "bands": scene.sh_degree, "codebook": levels, "files": list(sh_pictures)}
         pictures |= sh_pictures
     contents = {META: json.dumps(meta, separators=(",", ":"), allow_nan=False).encode()}
     for name, picture in pictures.items():

@@ -82,8 +82,7 @@ def pixel_gradient(raw, p, q, derivatives, steps):
 
 def ssim_window() -> Tensor:
     """The 11 taps of the Gaussian window with σ = 1.5, summing to 1; float64."""
-    offsets = torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=torch.float64)
-    taps = torch.exp(-offsets.square() / (2 * SSIM_SIGMA**2))
+    taps = torch.exp(-torch.arange(-SSIM_RADIUS, SSIM_RADIUS + 1, dtype=torch.float64).square() / (2 * SSIM_SIGMA**2))
     return taps / taps.sum()
 
 

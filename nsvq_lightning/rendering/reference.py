@@ -165,8 +165,7 @@ def render(splats: RawSplats, camera: Camera, shading: Shading) -> Layers:
         strips.append(torch.cat(tiles, 1))
     blended = torch.cat(strips, 0)
     transmittance = blended[..., 4]
-    image = blended[..., :3] + transmittance[..., None] * background
-    return image, 1 - transmittance, radii, means2d, blended[..., 3]
+    return blended[..., :3] + transmittance[..., None] * background, 1 - transmittance, radii, means2d, blended[..., 3]
 
 
 class _WatchOffsets(torch.autograd.Function):

@@ -91,8 +91,7 @@ def _drawn(signs: Generator, image: Tensor) -> Tensor:
 def below_cap(splats: SplatTensors) -> RawSplats:
     """The splats, detached, with opacities below the rasterizer's cap, where pixels have no gradient."""
     raw = detached(splats)
-    limit = torch.logit(torch.tensor(ALPHA_MAX - 0.01)).item()
-    return raw._replace(opacities=raw.opacities.clamp_max(limit))
+    return raw._replace(opacities=raw.opacities.clamp_max(torch.logit(torch.tensor(ALPHA_MAX - 0.01)).item()))
 
 
 def by_opacity(opacities: Tensor) -> Tensor:

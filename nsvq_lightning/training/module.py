@@ -387,8 +387,7 @@ class SplatModule(LightningModule):
         Raises:
             FormatError: The checkpoint is damaged, or its settings name something that has not been imported.
         """
-        checkpoint = resume.PlainCheckpointIO().load_checkpoint(checkpoint_path)
-        stored = checkpoint.get(cls.CHECKPOINT_HYPER_PARAMS_KEY, {})
+        stored = resume.PlainCheckpointIO().load_checkpoint(checkpoint_path).get(cls.CHECKPOINT_HYPER_PARAMS_KEY, {})
         resume.check_settings(checkpoint_path, {k: v for k, v in stored.items() if k not in settings})
         return super().load_from_checkpoint(checkpoint_path, *args, **settings)
 

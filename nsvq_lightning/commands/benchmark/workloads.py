@@ -124,8 +124,7 @@ def _positions(count: int, rng: np.random.Generator) -> Float64s:
     quarter, tenth = int(0.25 * count), int(0.10 * count)
     sphere = _directions(rng, quarter, 3) * 0.9 + rng.normal(size=(quarter, 3)) * 0.02
     x = rng.uniform(-2.2, 2.2, quarter)
-    y = 0.9 + rng.normal(size=quarter) * 0.02
-    ground = np.c_[x, y, rng.uniform(-2.2, 2.2, quarter)]
+    ground = np.c_[x, 0.9 + rng.normal(size=quarter) * 0.02, rng.uniform(-2.2, 2.2, quarter)]
     box = rng.uniform(-0.4, 0.4, (tenth, 3))
     axis = rng.integers(0, 3, tenth)
     box[np.arange(tenth), axis] = 0.4 * (rng.integers(0, 2, tenth) * 2 - 1)
