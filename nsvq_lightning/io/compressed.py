@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from nsvq_lightning.io.errors import FormatError
+from nsvq_lightning.io.morton import spatial_order
 from nsvq_lightning.io.numbers import finite_logits, finite_logs
 from nsvq_lightning.rendering.sampling import MAX_CAMERAS, Sampling, fewer_cameras
 from nsvq_lightning.splats import attributes as splat
@@ -309,8 +310,6 @@ class CompressedScene:
 
     def in_morton_order(self) -> "CompressedScene":
         """The splats in Morton order of their positions, in which many formats hold them: what is near follows."""
-        from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
-
         return self.in_order(spatial_order(self.means))
 
     def in_order(self, order: Integers) -> "CompressedScene":

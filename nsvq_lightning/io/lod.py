@@ -18,6 +18,7 @@ import numpy as np
 from nsvq_lightning.io.atomic import StrPath, make_folder_of, write_bytes, write_text
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FormatError, Json, as_defect, naming_file
+from nsvq_lightning.io.morton import spatial_order
 from nsvq_lightning.io.sog import META, PALETTE_LIMIT, read_sog, sog_contents
 from nsvq_lightning.splats.conventions import Float64s, Integers, unit
 from nsvq_lightning.top_level import log
@@ -93,8 +94,6 @@ def write_lod(
 
 def _tree(levels: Sequence[CompressedScene]) -> tuple[Json, list[tuple[list[Integers], Json]]]:
     """The root, and in their order the leaves with the splats of each level in them."""
-    from nsvq_lightning.io.morton import spatial_order  # imports Numba, which readers do without
-
     # Splats of all levels, one level after another, and the first of each.
     means = np.concatenate([level.means for level in levels])
     boxes = np.concatenate([_boxes(level) for level in levels])

@@ -4,10 +4,8 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from nsvq_lightning.compute.jit import inline, kernel
-from nsvq_lightning.compute.memory import check_fit
 from nsvq_lightning.io.numbers import power_above, power_below
-from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int32s, Int64s, Integers, Uint64s, middle_of
+from nsvq_lightning.splats.conventions import Bools, Float32s, Float64s, Int64s, Integers, Uint64s, middle_of
 
 # Bits per coordinate: three coordinates make a key of 63 bits.
 AXIS_BITS = 21
@@ -15,10 +13,6 @@ AXIS_BITS = 21
 # Masks of groups of 1, 2, 4, 8, 16 and 21 adjacent bits, with gaps of twice that length between.
 _MASKS = 0x1249249249249249, 0x10C30C30C30C30C3, 0x100F00F00F00F00F, 0x1F0000FF0000FF, 0x1F00000000FFFF, 0x1FFFFF
 _SHIFTS = 2, 4, 8, 16, 32
-# Above every squared distance times the window.
-_NONE = 2.0**52
-# Rows before a row that are searched for neighbours. 64 instead of 16 would save another 0.05 of 8 bits of codes.
-_WINDOW = 16
 
 
 class Grid(NamedTuple):
@@ -95,56 +89,6 @@ def unmorton(keys: Uint64s) -> Int64s:
             bits = (bits | bits >> gap) & mask
         cells[:, axis] = bits
     return cells
-
-
-def nearest_before(cells: Int64s) -> Int32s:
-    """The two nearest ``[N, 2]`` of the 16 rows before each row of ``cells [N, 3]``, nearest first; -1 where none is.
-
-    Distances are integers, and the earlier of two equally near rows is taken: every machine finds the same rows.
-
-    Raises:
-        ValueError: ``cells`` is not ``[N, 3]``, or not contiguous.
-        TypeError: It is not int64.
-    """
-    check_fit("cells [N, 3] int64", cells)
-    found = np.empty((len(cells), 2), np.int32)
-    _search_before(np.ascontiguousarray(cells.T, np.float64), found)
-    return found
-
-
-# Rows that are searched side by side.
-_BLOCK = 256
-
-
-@kernel
-def _search_before(axes, found):  # type: ignore[no-untyped-def]
-    count = len(found)
-    for block in range(-(-count // _BLOCK)):
-        start = block * _BLOCK
-        end = min(start + _BLOCK, count)
-        # A distance and, for equal ones, the place in the window in one number, exact in float64: two minima without
-        # branches, in vectors along the rows.
-        first = np.full(_BLOCK, _NONE)
-        second = np.full(_BLOCK, _NONE)
-        for back in range(1, _WINDOW + 1):
-            for i in range(max(start, back), end):
-                x = axes[0, i] - axes[0, i - back]
-                y = axes[1, i] - axes[1, i - back]
-                z = axes[2, i] - axes[2, i - back]
-                found_now = (x * x + y * y + z * z) * _WINDOW + (_WINDOW - back)
-                least = first[i - start]
-                later = found_now if least < found_now else least
-                first[i - start] = found_now if found_now < least else least
-                second[i - start] = later if later < second[i - start] else second[i - start]
-        for i in range(start, end):
-            found[i, 0] = _row(i, first[i - start])
-            found[i, 1] = _row(i, second[i - start])
-
-
-@inline
-def _row(i, place):  # type: ignore[no-untyped-def]
-    """The row that a number of the search stands for; -1 for none."""
-    return i - (_WINDOW - np.int64(place) % _WINDOW) if place < _NONE else -1
 
 
 def spatial_order(means: Float32s) -> Integers:

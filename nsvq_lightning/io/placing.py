@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nsvq_lightning.io.compressed import CompressedScene
+from nsvq_lightning.rendering.sh import sh_rotation
 from nsvq_lightning.splats.conventions import Float64s, middle_of, turned
 
 if TYPE_CHECKING:
@@ -55,10 +56,6 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     Raises:
         ValueError: It stretches, mirrors or is not finite.
     """
-    import torch
-
-    from nsvq_lightning.rendering.sh import sh_rotation
-
     linear, shift = matrix[:3, :3], matrix[:3, 3] + matrix[:3, :3] @ scene.origin
     size = np.cbrt(np.linalg.det(linear))
     if not (
@@ -68,7 +65,7 @@ def moved(scene: CompressedScene, matrix: Float64s) -> CompressedScene:
     ):
         raise ValueError(f"{linear.tolist()} is no scaled rotation: splats can be turned and scaled evenly only")
     rotation = linear / size
-    harmonics = sh_rotation(torch.from_numpy(rotation), scene.sh_degree).numpy()
+    harmonics = sh_rotation(rotation, scene.sh_degree)
     means, origin = scene.means @ linear.T, np.zeros(3)
     if len(means) and np.linalg.norm(shift) > FAR * middle_of(means)[1] > 0:
         origin, shift = shift, origin  # which moves, then, and not what is relative to it

@@ -21,8 +21,8 @@ _ROWS = 1 << 12
 BINARY_REMEDY = "write it as text: usdcat -o scene.usda FILE"
 PRIM = "ParticleField3DGaussianSplat"
 _COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
-# Strings and comments.
-_WORDS = re.compile(r"""(\"{3}|'{3}|["'])(?:\\.|(?!\1).)*+\1|\#[^\n]*""", re.DOTALL)
+# Strings and comments. These begin with a set of letters, or all numbers are looked at with care: ten times as slow.
+_WORDS = re.compile(r"""(["'\#])(?:(?<=\#)[^\n]*|\1\1(?:\\.|(?!\1{3}).)*+\1{3}|(?:\\.|(?!\1).)*+\1)""", re.DOTALL)
 
 
 def write_usda(path: StrPath, scene: CompressedScene) -> int:
@@ -82,7 +82,7 @@ def read_usda(path: StrPath) -> CompressedScene:
         check_start(".usda", data, b"#usda")
         # No comments, and no strings but a letter, as of an axis: both may say anything.
         text = _WORDS.sub(lambda found: found[0] * (len(found[0]) == 3), data.decode("utf-8", "replace"))
-        about, *prims = re.split(r"\b(?:def|over|class)\s+", text)
+        about, *prims = re.split(r"[doc](?:(?<=\bd)ef|(?<=\bo)ver|(?<=\bc)lass)\s+", text)
         own = [prim for prim in prims if re.match(rf"{PRIM}\b", prim)]
         if len(own) != 1:
             raise FormatError(f"{len(own)} prims of the kind {PRIM}, not one", "export it anew with one")

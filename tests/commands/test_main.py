@@ -55,6 +55,19 @@ def test_help_of_commands_without_training_comes_without_torch() -> None:
     assert done.stdout.count("\nExamples:\n") == len(names) - 1  # info has none
 
 
+def test_files_of_other_programs_are_made_and_described_without_torch(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", plain_scene(20, 3))
+    names = ["b.ply", "b.compressed.ply", "b.splat", "b.spz", "b.glb", "b.usda"]
+    code = (
+        "import sys\nfrom nsvq_lightning.commands.main import main\n"
+        "for name in sys.argv[1:]: assert not main(['convert', 'a.ply', name]) and not main(['info', name])\n"
+        "assert not {'torch', 'numba', 'lightning'} & set(sys.modules)"
+    )
+    command = [sys.executable, "-c", code, *names]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
 def test_no_command_is_an_error_that_shows_them(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 2
     assert "nsvq COMMAND --help" in capsys.readouterr().out

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from viewer_scenes import plain_scene
 
 from nsvq_lightning.io import CompressedScene, read_scene, save
-from nsvq_lightning.io.morton import AXIS_BITS, Grid, morton_keys, nearest_before, spatial_order, unmorton
+from nsvq_lightning.io.morton import AXIS_BITS, Grid, morton_keys, spatial_order, unmorton
+from nsvq_lightning.io.nsvq.compact import nearest_before
 
 
 def test_keys_interleave_the_bits() -> None:

@@ -23,6 +23,8 @@ from struct import Struct
 import numpy as np
 import torch
 
+from nsvq_lightning.compute.jit import inline, kernel
+from nsvq_lightning.compute.memory import check_fit
 from nsvq_lightning.io import morton
 from nsvq_lightning.io.compressed import CompressedScene
 from nsvq_lightning.io.errors import FEW_ROWS, Bytes, FormatError, check_room
@@ -44,6 +46,11 @@ _GRID = Struct("<qqqd")
 # Where cells are wider than this share of the distance of four fifths of the splats from the middle, splats are stored
 # as those far away are: as large as the scene, they must stay behind what they are behind.
 _WIDE = 1 / 8
+
+# Above every squared distance times the window.
+_NONE = 2.0**52
+# Rows before a row that are searched for neighbours. 64 instead of 16 would save another 0.05 of 8 bits of codes.
+_WINDOW = 16
 
 # Encodings of the streams that an attribute has, by its storage and the ends of their names.
 _STREAMS = {
@@ -145,8 +152,58 @@ def _neighbours(keys: Uint64s, depths: Int64s, count: int) -> Int32s:
     """Two near rows ``[N, 2]`` before each row; for the far splats, which come last, the two rows before."""
     half = (1 << (morton.AXIS_BITS - depths)) >> 1
     neighbours = _before(count)
-    neighbours[: len(keys)] = morton.nearest_before(morton.unmorton(keys) + half[:, None])
+    neighbours[: len(keys)] = nearest_before(morton.unmorton(keys) + half[:, None])
     return neighbours
+
+
+def nearest_before(cells: Int64s) -> Int32s:
+    """The two nearest ``[N, 2]`` of the 16 rows before each row of ``cells [N, 3]``, nearest first; -1 where none is.
+
+    Distances are integers, and the earlier of two equally near rows is taken: every machine finds the same rows.
+
+    Raises:
+        ValueError: ``cells`` is not ``[N, 3]``, or not contiguous.
+        TypeError: It is not int64.
+    """
+    check_fit("cells [N, 3] int64", cells)
+    found = np.empty((len(cells), 2), np.int32)
+    _search_before(np.ascontiguousarray(cells.T, np.float64), found)
+    return found
+
+
+# Rows that are searched side by side.
+_BLOCK = 256
+
+
+@kernel
+def _search_before(axes, found):  # type: ignore[no-untyped-def]
+    count = len(found)
+    for block in range(-(-count // _BLOCK)):
+        start = block * _BLOCK
+        end = min(start + _BLOCK, count)
+        # A distance and, for equal ones, the place in the window in one number, exact in float64: two minima without
+        # branches, in vectors along the rows.
+        first = np.full(_BLOCK, _NONE)
+        second = np.full(_BLOCK, _NONE)
+        for back in range(1, _WINDOW + 1):
+            for i in range(max(start, back), end):
+                x = axes[0, i] - axes[0, i - back]
+                y = axes[1, i] - axes[1, i - back]
+                z = axes[2, i] - axes[2, i - back]
+                found_now = (x * x + y * y + z * z) * _WINDOW + (_WINDOW - back)
+                least = first[i - start]
+                later = found_now if least < found_now else least
+                first[i - start] = found_now if found_now < least else least
+                second[i - start] = later if later < second[i - start] else second[i - start]
+        for i in range(start, end):
+            found[i, 0] = _row(i, first[i - start])
+            found[i, 1] = _row(i, second[i - start])
+
+
+@inline
+def _row(i, place):  # type: ignore[no-untyped-def]
+    """The row that a number of the search stands for; -1 for none."""
+    return i - (_WINDOW - np.int64(place) % _WINDOW) if place < _NONE else -1
 
 
 def _stream_names(attributes: tuple[AttributeEntry, ...]) -> list[tuple[str, str]]:
