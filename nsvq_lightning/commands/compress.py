@@ -89,8 +89,8 @@ def run(options: Namespace) -> int:
     wrong = ""
     if not streamed and suffix_of(options.output) != ".nsvq":
         wrong = f"{options.output}: the result is a .nsvq file or {NAME}; 'nsvq convert' writes other formats"
-    elif streamed and (options.codebooks or options.max_error or options.target_bytes):
-        wrong = f"{NAME} has levels of detail (--levels), no codebooks and no limits"
+    elif streamed and (options.codebooks or options.max_error or options.target_bytes or options.level != LEVELS[0]):
+        wrong = f"{NAME} has levels of detail (--levels), no codebooks and no limits, and one --level"
     elif options.output.is_dir():
         wrong = f"{options.output} is a folder: name a file"
     elif options.levels and not streamed:

@@ -108,8 +108,6 @@ def _path(
 
     kind = options.path or ("through" if cameras else "orbit")
     fps = options.fps or FPS
-    if kind not in ("through", "orbit") and (options.frames or options.seconds):
-        raise ValueError(f"--frames and --seconds are for the paths through and orbit; {kind} has frames of its own")
     if kind not in ("through", "cameras", "orbit"):
         if not Path(kind).is_file():
             raise ValueError(f"--path {kind}: no such file; or name through, cameras or orbit")
@@ -123,6 +121,8 @@ def _path(
             raise ValueError(f"--path {kind} needs cameras of photos: name their folder (--data.root), or take orbit")
         log.info("no photos: cameras are guessed from the scene (-y is up); --data.root names their folder")
         cameras = likely_cameras(splats, 24)
+    if kind not in ("through", "orbit") and (options.frames or options.seconds):
+        raise ValueError(f"--frames and --seconds are for the paths through and orbit; {kind} has frames of its own")
     width, height = options.size or mode(camera.size for camera in cameras)
     if is_video and (width % 2 or height % 2):
         width, height = max(2, width - width % 2), max(2, height - height % 2)

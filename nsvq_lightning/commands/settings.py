@@ -23,7 +23,7 @@ BUDGET = "--callbacks.budget"
 SHORTHANDS = {
     "quality": "Splats, as a multiple of the default for the photos; more look better and take more bytes and time",
     "splats": "Splats of the scene, instead of --quality",
-    "bytes": "Size of the file, instead of --quality",
+    "bytes": "Size of the file at level compact, instead of --quality",
     "minutes": "Time to train on this machine, without evaluations: as many iterations as measured steps allow",
 }
 

@@ -266,4 +266,7 @@ def test_a_budget_in_bytes_knows_that_codebooks_are_smaller_where_splats_are_few
     assert splats(100_000, 0.6) > 10_000
     # As measured: fox and bonsai in best.yaml.
     assert splats(657_093, 0.6) == pytest.approx(72_233, rel=0.1)
+    # As measured: fox, bonsai and horns in fast.yaml, at a half or a quarter of their size, without codebooks.
+    for size, count in ((540_643, 20_353), (329_825, 12_057), (134_115, 4_643)):
+        assert splats_for_bytes(size, {}, 3, Precision(), 0.0, math.inf) == pytest.approx(count, rel=0.1)
     assert splats(1_440_071, 0.6) == splats(1_440_071, math.inf) == pytest.approx(167_805, rel=0.1)

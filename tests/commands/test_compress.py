@@ -211,6 +211,7 @@ def test_bad_files_and_aims_are_one_line_and_status_1(
         (["a.ply", "b.ply"], "is a .nsvq file or lod-meta.json"),
         (["a.ply", "b.nsvq", "--levels=2"], "--levels is for lod-meta.json"),
         (["a.ply", "lod-meta.json", "--codebooks=4k"], "no codebooks and no limits"),
+        (["a.ply", "lod-meta.json", "--level=paper"], "and one --level"),
         (["a.ply", "b.nsvq", "--max-error", "0"], "must be above 0"),
         (["a.ply", "b.nsvq", "--steps=0"], "--steps: must be above 0, got 0"),
         (["a.ply", "b.nsvq", "--splats=0"], "expected a number of splats, or a share such as 25%, got '0'"),

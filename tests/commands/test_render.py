@@ -138,6 +138,7 @@ def test_keyframes_are_followed(scene: Path, demo_scene: Path, tmp_path: Path) -
         (["--path", "cameras"], "--path cameras needs cameras of photos"),
         (["--path", "gone.json"], "gone.json"),
         (["--path", "circle"], "--path circle: no such file; or name through, cameras or orbit"),
+        (["--path", "circle", "--frames", "3"], "--path circle: no such file; or name through, cameras or orbit"),
         (["-o", "a.avi"], "a.avi: name a video (.mp4), or a folder"),
         (["--data.root", "nowhere"], "nowhere"),
     ],
