@@ -152,20 +152,16 @@ def _found_views(path: Path, root: Path | None, origin: tuple[float, ...]) -> "V
     from nsvq_lightning.data.transforms import has_poses
     from nsvq_lightning.rendering.camera_paths import CAMERAS, read_cameras
 
-    data = {}
+    data, folder = {}, root
     try:
         own = {**check_config(str(_run_of(path) / "config.yaml"))["data"]["init_args"]}
-        if not root or Path(own["root"]).expanduser().resolve() == root.resolve():
-            data = own
+        given = Path(own["root"]).expanduser()
+        if not root or given.resolve() == root.resolve():
+            data, folder = own, given if given.is_dir() else None
     except (KeyError, TypeError):  # a config of something else
         pass
     except ValueError as error:
         log.warning(f"{error}")
-    folder = root
-    if given := data.get("root"):
-        folder = Path(given).expanduser()
-        if not folder.is_dir():
-            folder = None
     if folder and (has_poses(folder) or not (folder / CAMERAS).is_file()):
         how = {name: data[name] for name in READ if name in data} | {"origin": origin}
         try:
@@ -237,6 +233,8 @@ def scene_with_views(
 ) -> "tuple[CompressedScene, list[Camera], Scene | None]":
     """A scene that was read, as :func:`trained_scene` gives it, and what is known of its photos, looked for once.
 
+    Of a run's ``scene.ply`` and the like, the ``scene.nsvq`` beside it says origin and background.
+
     Args:
         scene: The scene; cameras of its own stay.
         path: Its file.
@@ -249,12 +247,18 @@ def scene_with_views(
         ValueError: The folder ``root`` is not a scene. What is damaged beside the file is a warning.
     """
     from nsvq_lightning.io.compressed import on_white
+    from nsvq_lightning.io.nsvq.header import read_header
     from nsvq_lightning.rendering.camera_paths import arguments_of
     from nsvq_lightning.rendering.sampling import trained_by
 
     cameras = []
     photos = None
     try:
+        # What other formats cannot say, the file of the run does.
+        own = path.with_name("scene.nsvq")
+        if path.stem == "scene" and own.is_file() and (run := read_header(own)).splats == len(scene):
+            config = {"background": run.config.get("background"), **scene.config}
+            scene = replace(scene, origin=run.origin, config=config)
         known, photos = known_views(path, root, scene)
         cameras = list(known.values())
     except (ValueError, OSError) as error:
