@@ -384,7 +384,7 @@ def available_memory() -> int | None:
         limits += [1024 * int(number) for number in re.findall(r"^MemAvailable:\s+(\d+)", told, re.MULTILINE)]
     group = Path("/sys/fs/cgroup")
     with suppress(OSError, ValueError):  # "max" is no number, and no limit
-        limit = int((group / "memory.max").read_text(encoding="ascii"))
-        used = int((group / "memory.current").read_text(encoding="ascii"))
-        limits.append(max(0, limit - used))  # usage includes page cache, which is reclaimable
+        limit, used, facts = ((group / f"memory.{name}").read_text("ascii") for name in ("max", "current", "stat"))
+        cached = sum(map(int, re.findall(r"^inactive_file (\d+)", facts, re.MULTILINE)))  # which may go
+        limits.append(max(0, int(limit) - int(used) + cached))
     return min(limits, default=None)

@@ -146,21 +146,21 @@ def _parsed(data: bytes) -> tuple[Json, memoryview]:
 
 def _primitives(document: Json) -> Iterator[tuple[Json, Float64s]]:
     """Those with splats, and the matrix ``[4, 4]`` of the node that each is in."""
-    nodes = document["nodes"]
+    nodes = dict(enumerate(document["nodes"]))
     stack = [(number, np.eye(4)) for number in reversed(document["scenes"][document.get("scene", 0)]["nodes"])]
-    steps = 0
     while stack:
         number, outer = stack.pop()
-        node = nodes[number]
-        steps += 1
-        if steps > len(nodes):
-            raise ValueError("a node is in two others")
+        if number not in nodes:
+            raise ValueError("a node is in two others, or missing")
+        node = nodes.pop(number)
         matrix = outer @ _matrix(node)
         stack += [(child, matrix) for child in reversed(node.get("children", ()))]
         if "mesh" not in node:
             continue
         for primitive in document["meshes"][node["mesh"]]["primitives"]:
             if EXTENSION in primitive.get("extensions", {}):
+                if others := ", ".join(node.get("extensions", ())):  # EXT_mesh_gpu_instancing shows it several times
+                    log.warning(f"a node has {others}, which is not read: its splats are shown as without it")
                 yield primitive, matrix
 
 

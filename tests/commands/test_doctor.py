@@ -119,6 +119,18 @@ def test_little_memory_and_disk_are_noted(tmp_path: Path, monkeypatch: pytest.Mo
     assert [finding.verdict for finding in doctor.check_room(tmp_path)] == ["note", "problem"]
 
 
+@pytest.mark.parametrize(("limit", "left"), [("8000000000", 7_000_000_000), ("max", 20_000_000_000)])
+def test_page_cache_of_a_control_group_is_free(monkeypatch: pytest.MonkeyPatch, limit: str, left: int) -> None:
+    told = {
+        "/proc/meminfo": f"MemTotal: 30000000 kB\nMemAvailable:   {20_000_000_000 // 1024} kB\n",
+        "/sys/fs/cgroup/memory.max": f"{limit}\n",
+        "/sys/fs/cgroup/memory.current": "7900000000\n",
+        "/sys/fs/cgroup/memory.stat": "anon 1000000000\ninactive_file 6900000000\n",
+    }
+    monkeypatch.setattr(doctor.Path, "read_text", lambda path, encoding: told[str(path)])
+    assert doctor.available_memory() == pytest.approx(left, abs=1024)
+
+
 @pytest.mark.parametrize("factor", [1.01, float("nan")])
 def test_wrong_kernels_fail(monkeypatch: pytest.MonkeyPatch, factor: float) -> None:
     def wrong(splats, camera, *, backend):  # type: ignore[no-untyped-def]

@@ -267,3 +267,11 @@ def test_linear_light_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) 
     read_scene(write(tmp_path / "y.glb", document, data))
     assert "splats of the kernel beta are shown as of ellipse" in caplog.text
     assert "lin_rec709_display: colours are linear light" in caplog.text
+
+
+def test_instances_of_a_node_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    save(plain_scene(20, 1), tmp_path / "x.glb")
+    document, data = parts(tmp_path / "x.glb")
+    document["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}
+    assert len(read_scene(write(tmp_path / "y.glb", document, data))) == 20
+    assert "a node has EXT_mesh_gpu_instancing, which is not read" in caplog.text
