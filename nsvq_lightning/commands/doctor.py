@@ -268,8 +268,7 @@ def check_overlap(model: "ColmapModel") -> Findings:
     np.fill_diagonal(common, 0)
     best = common.max(axis=1) / own
     groups, group_of = connected_components(common >= 15, directed=False)
-    apart = group_of != np.bincount(group_of).argmax()
-    weak = np.flatnonzero(apart if groups > 1 else best < 0.3)
+    weak = np.flatnonzero(group_of != np.bincount(group_of).argmax() if groups > 1 else best < 0.3)
     named = some([names[i] for i in weak], 3)
     usual, least = 100 * np.median(best), 100 * best.min()
     text = f"a photo shares {usual:.0f} % of its points with its best partner, at least {least:.0f} %"
@@ -384,7 +383,7 @@ def available_memory() -> int | None:
         limits += [1024 * int(number) for number in re.findall(r"^MemAvailable:\s+(\d+)", told, re.MULTILINE)]
     group = Path("/sys/fs/cgroup")
     with suppress(OSError, ValueError):  # "max" is no number, and no limit
-        limit, used, facts = ((group / f"memory.{name}").read_text("ascii") for name in ("max", "current", "stat"))
-        cached = sum(map(int, re.findall(r"^inactive_file (\d+)", facts, re.MULTILINE)))  # which may go
+        limit, used, facts = ((group / f"memory.{name}").read_bytes() for name in ("max", "current", "stat"))
+        cached = sum(map(int, re.findall(rb"^inactive_file (\d+)", facts, re.MULTILINE)))  # which may go
         limits.append(max(0, int(limit) - int(used) + cached))
     return min(limits, default=None)

@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import shlex
 import sys
 from contextlib import suppress
 from importlib.util import find_spec
@@ -17,7 +16,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveCon
 
 from nsvq_lightning.callbacks import RunCheckpoint
 from nsvq_lightning.callbacks.standard import OPTIONAL, STANDARD
-from nsvq_lightning.commands import COMMANDS, OF_LIGHTNING
+from nsvq_lightning.commands import COMMANDS, OF_LIGHTNING, join
 from nsvq_lightning.commands.parser import QuietParser, class_help, first_sentence
 from nsvq_lightning.commands.settings import configs_among, find_config, settings_of
 from nsvq_lightning.data.colmap import check_name
@@ -267,7 +266,7 @@ def continuation(checkpoint: Path) -> str:
     program = ["python", "-m", "nsvq_lightning"] if as_module else ["nsvq"]
     folder, path = Path(os.path.normpath(checkpoint / "../..")).as_posix(), checkpoint.as_posix()
     options = [f"--config={folder}/config.yaml", f"--ckpt_path={path}", f"--trainer.run_folder={folder}"]
-    return shlex.join([*program, "fit", *options])
+    return join([*program, "fit", *options])
 
 
 def summary(folder: Path, metrics: Json) -> str:
@@ -281,5 +280,5 @@ def summary(folder: Path, metrics: Json) -> str:
         f"  {metrics['num_splats']} splats in {metrics['file_bytes']} bytes (scene.nsvq), "
         f"{metrics['ratio']:.1f} times smaller than the plain .ply\n"
         f"  {metrics['train_seconds']:.0f} s of training\n"
-        f"look at it: {way}{shlex.join(['nsvq', 'view', folder.as_posix()])}\n"
+        f"look at it: {way}{join(['nsvq', 'view', folder.as_posix()])}\n"
     )

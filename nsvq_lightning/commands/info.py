@@ -62,6 +62,5 @@ def _text(facts: Json) -> str:
     for key in ("metrics", "config"):
         if facts.get(key):
             # Without the outer braces; the lines between them are already indented by two.
-            lines = json.dumps(facts[key], indent=2, ensure_ascii=False).splitlines()[1:-1]
-            parts.append("\n".join([key, *lines]))
+            parts.append("\n".join([key, *json.dumps(facts[key], indent=2, ensure_ascii=False).splitlines()[1:-1]]))
     return "\n\n".join(parts)

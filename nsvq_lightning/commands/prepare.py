@@ -11,14 +11,13 @@ Examples:
 
 import json
 import os
-import shlex
 import shutil
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from tqdm import tqdm
 
-from nsvq_lightning.commands import say
+from nsvq_lightning.commands import join, say
 from nsvq_lightning.commands.arguments import positive
 from nsvq_lightning.io.atomic import write_text
 
@@ -83,7 +82,7 @@ def run(options: Namespace) -> int:
     if len(names) < 2:
         raise ValueError("; ".join([f"{source}: {len(names)} pictures are too few, a scene takes 50 to 300", *remarks]))
     if has_poses(source):
-        remarks.append(f"{source} has cameras already: nsvq fit --data.root {shlex.quote(source.as_posix())} uses them")
+        remarks.append(f"{source} has cameras already: nsvq fit --data.root {join([source.as_posix()])} uses them")
     heads = {name: image_head(images / name) for name in names}
     if in_place and max(head.orientation for head in heads.values()) >= ON_ITS_SIDE:
         remarks.append("some photos are stored on their side, as the scene will be: give them from another folder")
@@ -102,7 +101,7 @@ def run(options: Namespace) -> int:
     database = scene / reconstruct.DATABASE
     say(
         f"\n{database} ({database.stat().st_size / 1e6:.0f} MB) saves time when photos are added, and may be deleted",
-        f"next: nsvq fit --data.root {shlex.quote(scene.as_posix())}",
+        f"next: nsvq fit --data.root {join([scene.as_posix()])}",
         "(--minutes 5 stops after five minutes of training)",
     )
     return 0

@@ -10,13 +10,12 @@ Examples:
   nsvq merge parts -o scene.nsvq
 """
 
-import shlex
 import sys
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from shutil import rmtree
 
-from nsvq_lightning.commands import say
+from nsvq_lightning.commands import join, say
 from nsvq_lightning.commands.arguments import READ, positive
 from nsvq_lightning.commands.sweep import resolve
 
@@ -69,4 +68,4 @@ def run(options: Namespace) -> None:
         sys.stderr.write(f"{folder}: {train} train and {test} test photos\n")
         root = folder.resolve()
         ends = [f"--data.root={root}", f"--trainer.run_folder={root / RUN}", *AS_WRITTEN * bool(read)]
-        say(shlex.join(["nsvq", "fit", *behind, *options.further, *ends]))
+        say(join(["nsvq", "fit", *behind, *options.further, *ends]))

@@ -10,7 +10,6 @@ Examples:
 
 import json
 import re
-import shlex
 import signal
 import subprocess
 import sys
@@ -27,7 +26,7 @@ from warnings import catch_warnings
 
 import numpy as np
 
-from nsvq_lightning.commands import markdown_table, say
+from nsvq_lightning.commands import join, markdown_table, say
 from nsvq_lightning.commands.arguments import integers, names, positive
 from nsvq_lightning.commands.settings import expand
 from nsvq_lightning.io.atomic import write_text
@@ -238,7 +237,7 @@ def commands(runs: Sequence[Run]) -> Iterator[str]:
     for run in runs:
         if not run.is_finished:
             try:
-                yield shlex.join(["nsvq", *prepare(run)])
+                yield join(["nsvq", *prepare(run)])
             except FileExistsError as error:
                 log.info(f"{error}")
 

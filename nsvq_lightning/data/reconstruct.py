@@ -2,13 +2,14 @@
 
 import itertools
 import json
+import locale
 import os
 import re
 import sqlite3
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import chdir, closing, suppress
 from importlib import import_module
 from io import BytesIO
 from pathlib import Path, PurePath
@@ -123,10 +124,15 @@ def reconstruct(
     pycolmap = import_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     pycolmap.set_random_seed(0)
-    stamps = _extract(scene, photos, report, max_size, threads)
-    _compare(scene, photos, report, is_video, threads)
-    models = _map(scene, stamps, report, threads)
-    common = dict(_rows(scene, _PARTNERS, json.dumps(list(photos))))
+    # COLMAP takes names for those of the code page: so that they are UTF-8, and from the scene, as it still mistakes
+    # letters of the folders on the way.
+    if os.name == "nt":
+        locale.setlocale(locale.LC_CTYPE, ".UTF-8")
+    with chdir(scene):
+        stamps = _extract(Path(), photos, report, max_size, threads)
+        _compare(Path(), photos, report, is_video, threads)
+        models = _map(Path(), stamps, report, threads)
+        common = dict(_rows(Path(), _PARTNERS, json.dumps(list(photos))))
     if not models:
         why = "; ".join(oddities(photos)) or _NOTHING_IN_COMMON
         kept = "; the scene of before is as it was" if (scene / "sparse").is_dir() else ""

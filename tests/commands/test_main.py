@@ -422,3 +422,13 @@ def test_home_is_found_behind_an_equals_sign(
     write_ply("x.ply", plain_scene(5, 0))
     assert main(["render", "x.ply", "--output=~/missing/x.pdf"]) != 0
     assert f"{tmp_path}/missing/x.pdf" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("name", "quote"), [("posix", "'"), ("nt", '"')])
+def test_commands_that_are_said_are_for_the_shell_of_the_system(name: str, quote: str) -> None:
+    code = (
+        f"import os, subprocess, nsvq_lightning; os.name = {name!r}\n"
+        "from nsvq_lightning.commands import join; print(join(['nsvq', 'a b']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == f"nsvq {quote}a b{quote}\n"
