@@ -124,8 +124,7 @@ def _shuffle(builder, first, second, lanes):
 
 def _broadcast(builder, kind, scalar):
     undefined = ir.Constant(kind, ir.Undefined)
-    inserted = builder.insert_element(undefined, scalar, _i32(0))
-    return _shuffle(builder, inserted, undefined, [0] * kind.count)
+    return _shuffle(builder, builder.insert_element(undefined, scalar, _i32(0)), undefined, [0] * kind.count)
 
 
 def _llvm(builder, name, values, result=_VF):

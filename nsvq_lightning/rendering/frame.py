@@ -49,8 +49,7 @@ class Frame(NamedTuple):
         as four fifths of them. Of cameras in one place, the unit is that of the files.
         """
         middle = np.median(centres, axis=0)
-        extent = 1.1 * reach_of(np.linalg.norm(centres - middle, axis=1))
-        return cls(extent / EXTENT or 1.0, tuple(middle.tolist()))
+        return cls(1.1 * reach_of(np.linalg.norm(centres - middle, axis=1)) / EXTENT or 1.0, tuple(middle.tolist()))
 
     def relative_to(self, origin: Place) -> "Frame":
         """The same coordinates of files whose positions are relative to another origin."""

@@ -128,6 +128,7 @@ def test_page_cache_of_a_control_group_is_free(monkeypatch: pytest.MonkeyPatch, 
         "/sys/fs/cgroup/memory.stat": "anon 1000000000\ninactive_file 6900000000\n",
     }
     monkeypatch.setattr(doctor.Path, "read_text", lambda path, encoding: told[str(path)])
+    monkeypatch.setattr(doctor.Path, "read_bytes", lambda path: told[str(path)].encode())
     assert doctor.available_memory() == pytest.approx(left, abs=1024)
 
 

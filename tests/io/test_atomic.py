@@ -44,7 +44,7 @@ def test_a_full_disk_is_told_with_the_file(tmp_path: Path) -> None:
         with atomic_path(path) as outer, atomic_write(outer):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    with pytest.raises(OSError, match=r"No space left on device: '.*/scene\.ply'"):
+    with pytest.raises(OSError, match=r"No space left on device: '.*[/\\]scene\.ply'"):
         write()
 
 

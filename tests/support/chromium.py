@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shutil
@@ -100,6 +99,8 @@ class Page:
 @contextmanager
 def chromium(profile: Path) -> Iterator[Page]:
     """A page of a Chromium of its own, with its profile in a folder."""
+    import fcntl  # which Windows lacks
+
     assert EXECUTABLE is not None
     commands, writer = os.pipe()
     reader, answers = os.pipe()

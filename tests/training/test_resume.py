@@ -35,6 +35,11 @@ from nsvq_lightning.training.schedule import Schedule
 SCENE = {"splats.means": torch.arange(300.0).view(100, 3), "_extra_state": torch.zeros(4)}
 
 
+def begins(path: Path) -> str:
+    """What an error about a file matches."""
+    return f"^{re.escape(str(path))}:"
+
+
 def write(path: Path, state: dict[str, Tensor] = SCENE, **more: Any) -> bytes:
     """Write a checkpoint; returns its bytes."""
     own = {"history": [], "schedule": {}, "quantizer_settings": {}}
@@ -65,7 +70,7 @@ def test_truncated_checkpoints_are_refused(part: float, tmp_path: Path) -> None:
     path = tmp_path / "a.ckpt"
     whole = write(path)
     path.write_bytes(whole[: int(part * len(whole))])
-    with pytest.raises(FormatError, match=rf"^{path}: truncated, .*; pass a checkpoint that nsvq fit"):
+    with pytest.raises(FormatError, match=rf"{begins(path)} truncated, .*; pass a checkpoint that nsvq fit"):
         read_checkpoint(path)
 
 
@@ -75,7 +80,7 @@ def test_a_single_changed_number_is_found(tmp_path: Path) -> None:
     whole[whole.index(SCENE["splats.means"][40:60].numpy().tobytes())] ^= 1
     path.write_bytes(whole)
     torch.load(path, weights_only=True)  # torch does not see it
-    with pytest.raises(FormatError, match=rf"^{path}: damaged, its part \S+ is not what was written"):
+    with pytest.raises(FormatError, match=rf"{begins(path)} damaged, its part \S+ is not what was written"):
         read_checkpoint(path)
 
 
@@ -83,7 +88,7 @@ def test_code_is_not_run(tmp_path: Path) -> None:
     path, mark = tmp_path / "a.ckpt", tmp_path / "mark"
     write(path, extra=Harmful(mark))
     for read in (read_checkpoint, lambda p: PlainCheckpointIO().load_checkpoint(p, weights_only=False)):
-        with pytest.raises(FormatError, match=rf"^{path}: refused, it holds an object of posix.mkdir"):
+        with pytest.raises(FormatError, match=rf"{begins(path)} refused, it holds an object of posix.mkdir"):
             read(path)
     assert not mark.exists()
     torch.load(path, weights_only=False)  # it would have been
@@ -166,18 +171,18 @@ def test_a_scene_is_the_same_with_other_photos_in_another_place(
 def test_what_is_no_checkpoint_of_this_package_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.ckpt"
     write(path, nn.Linear(2, 3).state_dict())
-    with pytest.raises(FormatError, match=rf"^{path}: a checkpoint of another model, which has weight, bias but"):
+    with pytest.raises(FormatError, match=rf"{begins(path)} a checkpoint of another model, which has weight, bias but"):
         read_checkpoint(path)
     torch.save({"state_dict": SCENE, "pytorch-lightning_version": "2.6.6", "history": []}, path)
-    with pytest.raises(FormatError, match=rf"^{path}: a checkpoint of another version, without quantizer_sett"):
+    with pytest.raises(FormatError, match=rf"{begins(path)} a checkpoint of another version, without quantizer_sett"):
         read_checkpoint(path)
     torch.save({"weights": torch.ones(2)}, path)
-    with pytest.raises(FormatError, match=rf"^{path}: not a checkpoint of Lightning"):
+    with pytest.raises(FormatError, match=rf"{begins(path)} not a checkpoint of Lightning"):
         read_checkpoint(path)
     path.write_text("no archive at all")
-    with pytest.raises(FormatError, match=rf"^{path}: truncated, or not a checkpoint"):
+    with pytest.raises(FormatError, match=rf"{begins(path)} truncated, or not a checkpoint"):
         read_checkpoint(path)
-    with pytest.raises(FormatError, match=rf"^{tmp_path}: damaged, or not a checkpoint \(.*[Dd]irectory"):
+    with pytest.raises(FormatError, match=rf"{begins(tmp_path)} damaged, or not a checkpoint \(.*[Dd]irectory"):
         read_checkpoint(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"none\.ckpt: no such checkpoint; pass a checkpoint"):
         read_checkpoint(tmp_path / "none.ckpt")

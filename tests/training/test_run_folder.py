@@ -36,7 +36,7 @@ def callbacks() -> list[Callback]:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("logger", [False, [Elsewhere(), Elsewhere()]], ids=["none", "two with a place of their own"])
@@ -100,6 +100,8 @@ def taken_by(
     folder: Path, processes: int, then: Callable[[], object] = lambda: None, checkpoint: Path | None = None
 ) -> list[str]:
     """What each of some processes is told that take a folder at once, and live until the last one has tried."""
+    if not hasattr(os, "fork"):
+        pytest.skip("this system has no fork")
     fork = multiprocessing.get_context("fork")
     told, barrier = fork.SimpleQueue(), fork.Barrier(processes)
 
@@ -159,6 +161,8 @@ def test_a_killed_run_holds_no_folder_and_what_it_left_unfinished_goes(tmp_path:
 def test_a_folder_that_cannot_be_locked_is_used_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    pytest.importorskip("fcntl", reason="this system has other locks")
+
     def no_locks(*_: object) -> None:
         raise OSError(37, "No locks available")
 
