@@ -134,7 +134,8 @@ class PhaseSchedule(SplatCallback):
             if steps != trainer.max_steps:
                 self._set_max_steps(trainer, steps)
                 log.info(f"iterations: {steps} for {photos} photos; --callbacks.phases.iterations_per_photo changes it")
-        total = self.total if self.total is not None else trainer.max_steps
+        # That of an earlier run's config; where its checkpoint goes on, it holds.
+        total = trainer.max_steps if self.total is None or (self.minutes and not trainer.ckpt_path) else self.total
         if total < 1:
             raise ValueError(
                 f"the run has no length: trainer.max_steps is {trainer.max_steps}; set trainer.max_steps (45000 in the "
@@ -142,6 +143,8 @@ class PhaseSchedule(SplatCallback):
             )
         self._steps = trainer.max_steps if trainer.max_steps >= 0 else total
         module.schedule = self.schedule(total)
+        if trainer.max_steps > 1.25 * total:
+            log.info(f"the phases are those of {total} iterations: --callbacks.phases.total=null scales them")
         if trainer.max_steps > 0 and module.schedule.phase_at(trainer.max_steps) < module.schedule.phase_at(total):
             log.warning(
                 f"trainer.max_steps={trainer.max_steps} ends this run in its "

@@ -62,6 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="replace", line_buffering=True)
     if own_process:
         sys.unraisablehook = _once_more
+        atexit.register(_hush)
         for number in (signal.SIGHUP, signal.SIGUSR1) if hasattr(signal, "SIGHUP") else ():
             if signal.getsignal(number) == signal.SIG_DFL:
                 signal.signal(number, _hang_up)
@@ -246,13 +247,12 @@ def _run_lightning(arguments: list[str], own_process: bool) -> int:
 
 @cache
 def _import_cli(own_process: bool) -> Any:
-    """Our :class:`LightningCLI`; to look for garbage among what it imports would take a second here, two at the end.
+    """Our :class:`LightningCLI`; to look for garbage among what it imports would take a second.
 
     A process that is not ours alone keeps the collector that it has.
     """
     if own_process:
         gc.disable()
-        atexit.register(_hush)
     try:
         from nsvq_lightning.commands.fit import SplatCLI
     finally:
@@ -263,7 +263,8 @@ def _import_cli(own_process: bool) -> Any:
 
 
 def _hush() -> None:
-    """Let libraries of nanobind, such as Triton's, not complain at the very end of what was kept from the collector."""
+    """Look for no garbage at the very end, which takes a second, and let nanobind's libraries not complain of it."""
+    gc.freeze()
     sys.stderr.flush()
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 

@@ -132,10 +132,10 @@ def plan(options: Namespace) -> list[Run]:
     for scene in filter(None, options.scenes):
         if not Path(scene).is_dir():
             raise ValueError(f"{scene} is no folder; --scenes takes COLMAP folders with commas between them")
-    log.info("planning the runs takes half a second for each")
+    log.info("planning the runs takes a quarter of a second for each")
     common = [*options.further, "--trainer.logger=false"]
     if steps := options.max_steps:
-        others = [f"--callbacks.phases.{length}=null" for length in ("iterations_per_photo", "minutes")]
+        others = [f"--callbacks.phases.{length}=null" for length in ("iterations_per_photo", "minutes", "total")]
         common += [f"--trainer.max_steps={steps}", *others]
     runs: list[Run] = []
     for config in options.configs:

@@ -92,9 +92,7 @@ def save(scene: AnySplats, path: StrPath, storage: Storage | str | None = None, 
         raise ValueError(f"cannot write {path}: {suffix_of(path)} is only read")
     with naming_file(path):
         scene = CompressedScene.from_splats(scene).finite()
-    lost = {"background": scene.background}
-    if suffix_of(path) != ".glb":
-        lost = {"origin": scene.origin} | lost
+    lost = ({} if suffix_of(path) == ".glb" else {"origin": scene.origin}) | {"background": scene.background}
     if any(map(any, lost.values())) and not entry.native:
         told = ", ".join(f"{name} {value}" for name, value in lost.items())
         log.warning(f"{path}: not stored: {told}; set in the viewer")

@@ -95,9 +95,8 @@ class Sampling(NamedTuple):
         for place in places.to(means):
             distance = (means - place).norm(dim=1)
             nearest, farthest = torch.minimum(nearest, distance), torch.maximum(farthest, distance)
-        gap = 0.0
-        if len(places) > 1:
-            gap = float(torch.cdist(places, places).fill_diagonal_(math.inf).amin(1).median())
+        between = torch.cdist(places, places).fill_diagonal_(math.inf)
+        gap = float(between.amin(1).median()) if len(places) > 1 else 0.0
         distances = torch.stack([torch.maximum(nearest - gap, nearest / 2), farthest + gap])
         return cls(distances, np.unique(cameras[:, 3]).tolist())
 

@@ -185,6 +185,4 @@ def _duration(seconds: float) -> str:
     hours, minutes = divmod(minutes, 60)
     if hours:
         return f"{hours} h {minutes} min"
-    if minutes:
-        return f"{minutes} min {rest} s"
-    return f"{seconds:.1f} s"
+    return f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"

@@ -260,6 +260,4 @@ def background_of(scene: Scene, asked: str) -> str:
         raise ValueError(
             f"the photos of {scene.root} are white around their objects, model.background is {asked}: leave it at auto"
         )
-    if asked != "auto":
-        return asked
-    return "white" if scene.white else "black"
+    return asked if asked != "auto" else "white" if scene.white else "black"

@@ -79,6 +79,27 @@ def test_a_trainer_that_fits_again_asks_for_what_it_was_given() -> None:
     assert module.schedule.total == 30
 
 
+@pytest.mark.parametrize(("checkpoint", "total"), [(None, 900), ("last.ckpt", 30)])
+def test_minutes_scale_the_phases_of_an_earlier_run(
+    monkeypatch: pytest.MonkeyPatch, checkpoint: str | None, total: int
+) -> None:
+    monkeypatch.setattr("nsvq_lightning.callbacks.schedule.iterations_within", lambda *_: 900)
+    trainer: Any = Several(SimpleNamespace(max_steps=30))
+    trainer.ckpt_path = checkpoint
+    module: Any = SimpleNamespace()
+    PhaseSchedule(total=30, minutes=5).before_fit(trainer, module)
+    assert (trainer.max_steps, module.schedule.total) == (900, total)
+
+
+def test_a_last_phase_that_goes_on_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO"):
+        for steps in (1000, 1250, 1300):
+            said = len(caplog.records)
+            PhaseSchedule(total=1000).before_fit(Several(SimpleNamespace(max_steps=steps)), SimpleNamespace())  # type: ignore[arg-type]
+            assert ("the phases are those of 1000 iterations" in caplog.text) == (steps == 1300)
+    assert len(caplog.records) == said + 1
+
+
 class Several:
     """A trainer of several scenes."""
 
