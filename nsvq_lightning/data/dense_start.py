@@ -281,7 +281,7 @@ def far_points(scene: Scene, points: Tensor) -> tuple[Tensor, Tensor]:
     circle = np.sqrt(1 - height**2)
     places = radius * np.stack([circle * np.cos(turn), circle * np.sin(turn), height], axis=1)
     sums, photos, sightings = colors_at(scene, places, BLUR)
-    if photos.sum() <= sightings / 2:
+    if photos.sum() <= sightings.sum() / 2:
         return torch.empty(0, 3), torch.empty(0, 3)
     shown = np.flatnonzero(photos)
     _, alike = cKDTree(places[shown]).query(places, range(1, min(ALIKE, len(shown)) + 1))

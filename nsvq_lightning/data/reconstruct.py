@@ -399,7 +399,7 @@ OTHER = re.compile(
     r"(un)?distorted|dense|corrected_images|\.?thumb.*|images_\d+|[248]x|sparse|runs",
     re.IGNORECASE,
 )
-OTHER_FILES = re.compile(r"thumbnail|(thumb|conf|depth|mask)_\d+|.*\d_(mask|depth|normal)(_\d+)?", re.IGNORECASE)
+OTHER_FILES = re.compile(r"thumbnail|(thumb|conf|depth|mask)_\d+|.*(\d_(mask|depth|normal)(_\d+)?|\.mask)", re.I)
 
 
 def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
@@ -412,7 +412,7 @@ def photos_in(folder: Path) -> tuple[list[Path], LeftOut]:
     """
     suffixes = PHOTOS + CONVERTED + RAW
     files = photos_below(folder, suffixes)
-    other = {path for path in files if _is_other(path.relative_to(folder))}
+    other = {path for path in files if _is_other(path.relative_to(folder)) or path.with_suffix("").is_file()}
     files.sort(key=lambda path: (path in other, path.parent != folder, suffixes.index(path.suffix.lower()), path))
     taken: dict[str, Path] = {}
     left = defaultdict(list)

@@ -308,6 +308,13 @@ def test_photos_of_folders_keep_apart(tmp_path: Path) -> None:
     assert sum(map(len, left.values())) == 6
 
 
+def test_masks_of_colmap_and_realityscan_are_no_photos(tmp_path: Path) -> None:
+    _touch(tmp_path, "1.jpg", "1.jpg.png", "2.jpg", "2.jpg.mask.png", "3.jpg.jpg")
+    found, left = photos_in(tmp_path)
+    assert [path.name for path in found] == ["1.jpg", "2.jpg", "3.jpg.jpg"]
+    assert sum(map(len, left.values())) == 2
+
+
 def test_what_apps_export_beside_photos_is_left_out(tmp_path: Path) -> None:
     keyframes = [f"keyframes/{folder}/17.{kind}" for folder, kind in (("images", "jpg"), ("corrected_images", "jpg"))]
     _touch(tmp_path / "polycam", "thumbnail.jpg", *keyframes, "keyframes/confidence/17.png", "keyframes/depth/17.png")

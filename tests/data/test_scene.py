@@ -433,6 +433,26 @@ def test_points_of_a_table_that_no_two_photos_saw_may_be_elsewhere(
         assert (scene.cloud, scene.grey, is_elsewhere(scene)) == (True, False, move == "turned")
 
 
+def test_points_that_masks_leave_out_say_nothing_of_the_others(shared_scenes: Path, tmp_path: Path) -> None:
+    """Those before and behind an object, which is all that masks leave."""
+    root = tmp_path / "scene"
+    root.mkdir()
+    for path in (shared_scenes / "kitchen25").iterdir():
+        (root / path.name).symlink_to(path)
+    scene = load_scene(root, factor=8)
+    middle = scene.points.median(0).values.double().numpy()[None]
+    (root / "masks").mkdir()
+    for name, camera in zip(scene.names, scene.cameras, strict=True):
+        mask = np.zeros((camera.height, camera.width), np.uint8)
+        column, row, _ = projected(middle, camera)
+        cv2.circle(mask, (int(column[0]), int(row[0])), camera.height // 4, 255, -1)
+        cv2.imwrite(str(root / "masks" / f"{name}.png"), mask)
+    scene = load_scene(root, factor=8)
+    for turn, wrong in (1.0, False), (-1.0, True):
+        points = scene.points * torch.tensor([1.0, turn, turn])
+        assert is_elsewhere(replace(scene, points=points, cloud=True)) == wrong
+
+
 def test_poses_that_do_not_show_the_points_of_their_model_are_told(
     demo_scene: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

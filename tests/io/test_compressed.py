@@ -69,8 +69,11 @@ def test_activations_instead_of_logits_are_told(caplog: pytest.LogCaptureFixture
     rows = plain_scene(20, 1).tensors()._asdict()
     CompressedScene.from_splats(rows)
     assert not caplog.text
-    CompressedScene.from_splats(rows | {"scales": rows["scales"].exp()})
-    assert "all scales above 0, or" in caplog.text
+    for outlier, told in ((1.0, False), (10.0, True)):  # a scene in millimetres, and one of lengths
+        scales = rows["scales"] - rows["scales"].min() + 5
+        scales[0] *= outlier
+        CompressedScene.from_splats(rows | {"scales": scales})
+        assert ("all scales above 0, or" in caplog.text) == told
     caplog.clear()
     CompressedScene.from_splats(rows | {"opacities": rows["opacities"].sigmoid()})
     assert "all opacities are in [0, 1]: logits are expected" in caplog.text
