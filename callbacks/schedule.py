@@ -221,8 +221,7 @@ class LearningRateDecay(SplatCallback):
         super().on_train_batch_start(trainer, module, *args)
         schedule = module.schedule
         start = schedule.ends[Phase.QUANTIZE] if self.start is None else schedule.iteration(self.start)
-        end = schedule.ends[Phase.FINETUNE]
-        progress = min(max((trainer.global_step + 1 - start) / max(end - start, 1), 0.0), 1.0)
+        progress = min(max((trainer.global_step + 1 - start) / max(schedule.ends[Phase.FINETUNE] - start, 1), 0.0), 1.0)
         for group in trainer.optimizers[0].param_groups:
             if group["name"] != "means":
                 module.scale_rate(group["name"], self.final**progress)

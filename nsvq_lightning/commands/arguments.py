@@ -5,6 +5,7 @@ import os
 import re
 from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -251,14 +252,14 @@ def scene_with_views(
     from nsvq_lightning.rendering.camera_paths import arguments_of
     from nsvq_lightning.rendering.sampling import trained_by
 
-    cameras = []
-    photos = None
+    cameras, photos = [], None
+    with suppress(ValueError, OSError):  # what other formats cannot say, the file of the run does if there is one
+        run = read_header(path.with_name("scene.nsvq"))
+        if path.name.startswith("scene.") and run.splats == len(scene):
+            origin = scene.origin if path.suffix == ".glb" else run.origin
+            config = {"background": run.config.get("background", "black"), **scene.config}
+            scene = replace(scene, origin=origin, config=config)
     try:
-        # What other formats cannot say, the file of the run does.
-        own = path.with_name("scene.nsvq")
-        if path.stem == "scene" and own.is_file() and (run := read_header(own)).splats == len(scene):
-            config = {"background": run.config.get("background"), **scene.config}
-            scene = replace(scene, origin=run.origin, config=config)
         known, photos = known_views(path, root, scene)
         cameras = list(known.values())
     except (ValueError, OSError) as error:

@@ -120,8 +120,7 @@ def _write_levels(options: Namespace, compressor: "Compressor", most: int) -> No
     wanted = dict.fromkeys(max(1, most // 4**level) for level in range(options.levels or LOD_LEVELS))
     levels = [scene if count == len(scene) else compressor.at(Setting(count, "none")).scene for count in wanted]
     size = save(levels[0], options.output, coarser=levels[1:])
-    counts = ", ".join(f"{len(level):,}" for level in levels)
-    say(f"{options.output}: levels of {counts} splats, {size:,} bytes")
+    say(f"{options.output}: levels of {', '.join(f'{len(level):,}' for level in levels)} splats, {size:,} bytes")
 
 
 def _write_file(options: Namespace, compressor: "Compressor", most: int, views: str) -> None:

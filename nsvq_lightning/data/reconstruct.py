@@ -129,10 +129,11 @@ def reconstruct(
     if os.name == "nt":
         locale.setlocale(locale.LC_CTYPE, ".UTF-8")
     with chdir(scene):
-        stamps = _extract(Path(), photos, report, max_size, threads)
-        _compare(Path(), photos, report, is_video, threads)
-        models = _map(Path(), stamps, report, threads)
-        common = dict(_rows(Path(), _PARTNERS, json.dumps(list(photos))))
+        here = Path() if os.name == "nt" else Path.cwd()
+        stamps = _extract(here, photos, report, max_size, threads)
+        _compare(here, photos, report, is_video, threads)
+        models = _map(here, stamps, report, threads)
+        common = dict(_rows(here, _PARTNERS, json.dumps(list(photos))))
     if not models:
         why = "; ".join(oddities(photos)) or _NOTHING_IN_COMMON
         kept = "; the scene of before is as it was" if (scene / "sparse").is_dir() else ""

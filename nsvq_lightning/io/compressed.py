@@ -41,7 +41,7 @@ def warn_of_activations(logits: Arrays, scales: Arrays) -> None:
 
     Of surfels, the third scale is small. Of logarithms above 0, as in millimetres, the largest are near the usual one.
     """
-    axes = scales[:, :2]
+    axes = scales[..., :2]
     if logits.size and (0 <= logits.min() < logits.max() <= 1 or (axes.min() > 0 and axes.max() > 4 * np.median(axes))):
         log.warning("all scales above 0, or all opacities are in [0, 1]: logits are expected, and logarithms of scales")
 

@@ -67,8 +67,7 @@ def write_lod(
         for part, runs in enumerate(_files([(rows[number], node) for rows, node in leaves])):
             contents = sog_contents(splats.take(np.concatenate([rows for rows, _ in runs])), palette)
             # Those of two indices in one folder differ.
-            digest = sha256(b"".join(contents.values())).hexdigest()[:8]
-            folder = f"{path.name[: -len(NAME)]}{number}_{part}_{digest}"
+            folder = f"{path.name[: -len(NAME)]}{number}_{part}_{sha256(b''.join(contents.values())).hexdigest()[:8]}"
             (path.parent / folder).mkdir(exist_ok=True)
             for name, data in contents.items():
                 total += write_bytes(path.parent / folder / name, data)

@@ -239,8 +239,6 @@ class SplatModule(LightningModule):
                 "splats train in float32, and kernels compute in it whatever trainer.precision says; a scaled loss "
                 "would grow splats needlessly: leave it at 32-true, and the module as it is made"
             )
-        if self.trainer.accumulate_grad_batches < 1:
-            raise ValueError("trainer.accumulate_grad_batches must be at least 1")
         for callback in self.trainer.callbacks:  # type: ignore[attr-defined]  # Lightning does not type it
             if isinstance(callback, StochasticWeightAveraging | WeightAveraging | ModelPruning):
                 name, does = type(callback).__name__, "masks" if isinstance(callback, ModelPruning) else "averages"

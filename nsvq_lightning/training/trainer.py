@@ -61,9 +61,10 @@ class SplatTrainer(Trainer):
         rank_zero_only.rank = self.global_rank  # type: ignore[attr-defined]
         # SLURM's would write a checkpoint in the middle of an iteration, and every later run would begin from it.
         environment: Any = self._accelerator_connector.cluster_environment
-        environment.auto_requeue = False
-        if (others := environment.world_size()) > self.world_size:
-            log.warning(f"each of {others} processes trains the whole scene: set devices to share it")
+        if not kwargs.get("plugins"):
+            environment.auto_requeue = False
+            if (others := environment.world_size()) > self.world_size:
+                log.warning(f"if {others} processes are started, each trains the whole scene: set devices to share it")
         self.run_folder, self.allow_other_scene = run_folder, allow_other_scene
         if type(self.strategy.checkpoint_io) is TorchCheckpointIO:  # Lightning's own
             self.strategy.checkpoint_io = PlainCheckpointIO()

@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from inspect import signature
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -147,19 +148,32 @@ def test_splats_of_a_run_are_shown_in_front_of_what_it_says(tmp_path: Path) -> N
         assert trained_scene(tmp_path / "scene.ply", None).background == (shown,) * 3
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".glb", ".nsvq"])
-def test_other_files_of_a_run_have_its_origin_and_background(tmp_path: Path, suffix: str) -> None:
-    origin = (4e5, 5e6, 30.0)
+@pytest.mark.parametrize("origin", [(4e5, 5e6, 30.0), (400.0, 500.0, 30.0)])
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".glb", ".nsvq"])
+def test_other_files_of_a_run_have_its_origin_and_background(
+    tmp_path: Path, suffix: str, origin: tuple[float, float, float]
+) -> None:
+    def found(name: str) -> CompressedScene:
+        return scene_with_views(read_scene(tmp_path / name), tmp_path / name, None)[0]
+
+    def places(scene: CompressedScene) -> Any:
+        return np.sort(scene.means + np.array(scene.origin), axis=0)
+
     scene = replace(CompressedScene.from_splats(random_splats(9)), origin=origin, config={"background": "white"})
     for name in f"scene{suffix}", f"other{suffix}", "scene.nsvq":
         save(scene, tmp_path / name)
     for name, known in (f"scene{suffix}", True), (f"other{suffix}", suffix == ".nsvq"):
-        found, *_ = scene_with_views(read_scene(tmp_path / name), tmp_path / name, None)
-        assert (found.origin == origin) == (known or suffix == ".glb")
-        assert found.background == (float(known),) * 3
-    save(replace(scene.take(np.arange(8)), origin=(0, 0, 0)), tmp_path / "scene.nsvq")
-    if suffix == ".ply":  # of another scene
-        assert scene_with_views(read_scene(tmp_path / "scene.ply"), tmp_path / "scene.ply", None)[0].origin == (0, 0, 0)
+        assert found(name).background == (float(known),) * 3
+        if known or suffix == ".glb":
+            np.testing.assert_allclose(places(found(name)), places(scene), atol=0.05)
+        else:
+            assert found(name).origin == (0, 0, 0)
+    if suffix == ".ply":  # what is damaged, or of another scene, says nothing
+        for data in (tmp_path / "scene.nsvq").read_bytes()[:300], b"":
+            (tmp_path / "scene.nsvq").write_bytes(data)
+            assert found("scene.ply").origin == (0, 0, 0)
+        save(scene.take(np.arange(8)), tmp_path / "scene.nsvq")
+        assert found("scene.ply").origin == (0, 0, 0)
 
 
 def test_a_page_of_guessed_cameras_is_no_source_of_cameras(tmp_path: Path) -> None:

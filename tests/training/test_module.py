@@ -227,13 +227,6 @@ def test_given_splats_stay_as_they_are(demo_scene: Path) -> None:
     assert not torch.equal(module.splats.means, splats.means)
 
 
-@pytest.mark.parametrize("batches", [0, -1])
-def test_batches_that_are_added_up_are_one_at_least(demo_scene: Path, batches: int) -> None:
-    trainer = SplatTrainer(max_steps=4, accumulate_grad_batches=batches, callbacks=[], enable_checkpointing=False)
-    with pytest.raises(ValueError, match="accumulate_grad_batches must be at least 1"):
-        trainer.fit(SplatModule(codebooks=None), ColmapDataModule(demo_scene))
-
-
 def test_splats_of_another_precision_are_trained_in_float32() -> None:
     splats = SplatModule(codebooks=None, splats=make_splats().double()).splats
     assert {parameter.dtype for parameter in splats.parameters()} == {torch.float32}

@@ -155,4 +155,4 @@ def test_processes_that_each_train_the_whole_scene_are_told(
     for name, value in {"TORCHELASTIC_RUN_ID": "x", "WORLD_SIZE": "3", "RANK": "1", "LOCAL_RANK": "1"}.items():
         monkeypatch.setenv(name, value)
     SplatTrainer(accelerator="cpu", default_root_dir=tmp_path)
-    assert "each of 3 processes trains the whole scene" in caplog.text
+    assert "if 3 processes are started, each trains the whole scene" in caplog.text
