@@ -153,7 +153,7 @@ class SplatCLI(LightningCLI):
             parser.callback_keys.append(key)
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
-        if subcommand not in self._arguments:  # nobody asks it, and to fill it takes a tenth of a second
+        if self._arguments and subcommand not in self._arguments:  # to fill it takes a tenth of a second
             return self.init_parser(**kwargs)
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
         # Export reads no photos: any data module that can be built without options will do.
