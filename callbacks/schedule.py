@@ -134,7 +134,7 @@ class PhaseSchedule(SplatCallback):
             if steps != trainer.max_steps:
                 self._set_max_steps(trainer, steps)
                 log.info(f"iterations: {steps} for {photos} photos; --callbacks.phases.iterations_per_photo changes it")
-        # That of an earlier run's config; where its checkpoint goes on, it holds.
+        # Beside minutes, a total is that of an earlier run's config: it holds where a checkpoint of that run goes on.
         total = trainer.max_steps if self.total is None or (self.minutes and not trainer.ckpt_path) else self.total
         if total < 1:
             raise ValueError(

@@ -253,9 +253,9 @@ def scene_with_views(
     from nsvq_lightning.rendering.sampling import trained_by
 
     cameras, photos = [], None
+    own = path.with_name("scene.nsvq")
     with suppress(ValueError, OSError):  # what other formats cannot say, the file of the run does if there is one
-        run = read_header(path.with_name("scene.nsvq"))
-        if path.name.startswith("scene.") and run.splats == len(scene):
+        if path.name.startswith("scene.") and path != own and (run := read_header(own)).splats == len(scene):
             origin = scene.origin if path.suffix == ".glb" else run.origin
             config = {"background": run.config.get("background", "black"), **scene.config}
             scene = replace(scene, origin=origin, config=config)
