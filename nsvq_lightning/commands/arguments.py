@@ -198,12 +198,14 @@ def known_views(path: Path, root: Path | None, scene: "CompressedScene | None" =
         SceneError: The folder is not a scene.
         ValueError: What the run has recorded is damaged.
     """
-    from nsvq_lightning.data.scene import check_cameras
+    from nsvq_lightning.data.scene import check_cameras, check_colors
 
     cameras, photos = _found_views(path, root, scene.origin if scene else (0, 0, 0))
     try:
         if scene and cameras:
             check_cameras(list(cameras.values()), scene.means, None if root else scene.cameras)
+            if photos and (root or not len(scene.cameras)):
+                check_colors(photos, scene.means, scene.values("sh0"))
     except ValueError as error:
         log.warning(f"{path}: the cameras of {root or 'the folders beside it'} are not used: {error}")
         return {}, None

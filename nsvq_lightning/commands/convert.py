@@ -168,12 +168,13 @@ def _up(options: Namespace) -> Float64s:
 def _without_floaters(scene: CompressedScene, root: Path) -> CompressedScene:
     import torch
 
-    from nsvq_lightning.data.scene import check_cameras, load_scene, usable
+    from nsvq_lightning.data.scene import check_cameras, check_colors, load_scene, usable
     from nsvq_lightning.report.numbers import evaluate
     from nsvq_lightning.training.importance import floaters
 
     photos = usable(load_scene(root, origin=scene.origin))
     check_cameras(photos.cameras, scene.means, scene.cameras)
+    check_colors(photos, scene.means, scene.values("sh0"))
     splats = scene.tensors()
     look = renderer(on_white(scene) if photos.white else scene)
 

@@ -22,7 +22,7 @@ from nsvq_lightning.compression.basis import components
 from nsvq_lightning.compute.devices import best_device
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.datamodule import SceneDataModule
-from nsvq_lightning.data.scene import Scene, check_cameras, spread, usable
+from nsvq_lightning.data.scene import Scene, check_cameras, check_colors, spread, usable
 from nsvq_lightning.io.compressed import AnySplats, CompressedScene, on_white, renderer
 from nsvq_lightning.io.morton import spatial_order
 from nsvq_lightning.io.nsvq.file import decode, encode
@@ -553,6 +553,8 @@ def compress(
         scene = replace(scene, cameras=trained_by(cameras))
     shown = [torch.as_tensor(photo) for photo in photos]
     views = viewpoints.own_scene(scene.tensors(), cameras, photos=shown) if shown else None
+    if views:
+        check_colors(views, scene.means, scene.values("sh0"))
     compressor = Compressor(scene, cameras, views, **settings)
     left = len(scene) if left is None else min(left, len(scene))
     return compressor.best(left, codebooks or "none", target_bytes, max_error).scene

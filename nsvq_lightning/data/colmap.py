@@ -277,7 +277,7 @@ def read_model(root: Path, observations: bool = False, chosen: str | None = None
         cameras={row.camera_id: _camera(cameras[row.camera_id], files["cameras"]) for row in rows},
         points=points.xyz,
         colors=rgb_bytes(points.rgb),
-        observations=_observations(rows, points.tracks) if observations else None,
+        observations=_observations(rows, points.tracks if points.seen else ()) if observations else None,
         images_folder=next((str(each.absolute()) for each in beside if each.is_dir()), None),
         cloud=not points.seen and len(points.xyz) > MAX_UNSEEN,
     )

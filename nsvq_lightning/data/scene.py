@@ -40,6 +40,11 @@ Rows = tuple[int, ...]
 
 # So many cameras, and so many splats, are asked what cameras show, at most.
 SOME_CAMERAS, SOME_SPLATS = 300, 20_000
+# What is wrong with points and splats that are elsewhere (:func:`is_elsewhere`).
+ELSEWHERE = (
+    "are not where the photos show their colours: they are in other coordinates than the cameras; export both from one "
+    "program, in one unit and with the same axes, poses from world to camera and quaternions wxyz"
+)
 # Fewer points than this only fill up what photos show, as those without colours do: before the others, 100 cost every
 # sixth photo of bonsai255 0.9 dB.
 FEW_POINTS = 500
@@ -586,11 +591,22 @@ def is_elsewhere(scene: Scene) -> bool:
     return len(rows) < 2 or not np.corrcoef(shown.ravel(), known.ravel())[0, 1] > (0.5 if scene.cloud else 0.42)
 
 
-# What is wrong with them then.
-ELSEWHERE = (
-    "are not where the photos show their colours: they are in other coordinates than the cameras; export both from one "
-    "program, in one unit and with the same axes, poses from world to camera and quaternions wxyz"
-)
+def check_colors(scene: Scene, means: Float32s, sh0: Float32s) -> None:
+    """Check that splats, unless they are few, are where some of a scene's train photos show their colours.
+
+    Another scale shows so (:func:`is_elsewhere`), and what is turned about its cameras, as in nerfstudio's frame.
+
+    Args:
+        scene: Its photos and cameras.
+        means: Positions ``[N, 3]`` in its coordinates.
+        sh0: Coefficients ``[N, 1, 3]``.
+
+    Raises:
+        ValueError: They are elsewhere.
+    """
+    points, colors = torch.from_numpy(means), torch.from_numpy(sh0).flatten(1)
+    if is_elsewhere(replace(scene, points=points, colors=colors, cloud=False, train=spread(scene.train, 20))):
+        raise ValueError(f"splats {ELSEWHERE}")
 
 
 def usable(scene: Scene) -> Scene:

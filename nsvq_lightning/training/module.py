@@ -273,7 +273,7 @@ class SplatModule(LightningModule):
                 make = partial(run_scene.splats_of_file, self.init_from, self.scene)
                 self.active_sh_degree = degree
             self.splats = distributed.on_first_process(self.trainer, make).to(self.device)
-        run_scene.warn_of_others(self.trainer, self.splats.means, own)
+        run_scene.warn_of_others(self.trainer, self.splats, own)
         optimizer = optim.build_adam(optim.param_groups(self.splats, self.codebooks, self.rates, self.extent))  # type: ignore[arg-type]
         if self.rates.by_distance:
             run_scene.move_by_distance(self.trainer, optimizer, self.splats, self.extent)

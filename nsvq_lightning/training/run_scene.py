@@ -13,7 +13,7 @@ from torch.optim import Optimizer
 
 from nsvq_lightning.compute.memory import trim
 from nsvq_lightning.data.dense_start import dense_points, far_points
-from nsvq_lightning.data.scene import FEW_POINTS, ONE_PLACE, Scene, View, check_cameras, colors_at, spread
+from nsvq_lightning.data.scene import FEW_POINTS, ONE_PLACE, Scene, View, check_cameras, check_colors, colors_at, spread
 from nsvq_lightning.io.formats import read_scene
 from nsvq_lightning.random import generator
 from nsvq_lightning.rendering.camera import Camera
@@ -169,19 +169,21 @@ def splats_of_file(path: str, trained: SplatScene) -> Splats:
     return Splats.from_tensors(*trained.frame.splats(scene.decode()))
 
 
-def warn_of_others(trainer: Trainer, means: Tensor, own: bool) -> None:
-    """Warn where the trainer's photos do not show the splats ``[N, 3]`` that it starts from, in its frame.
+def warn_of_others(trainer: Trainer, splats: Splats, own: bool) -> None:
+    """Warn where the trainer's photos do not show the splats that it starts from, in its frame.
 
     Args:
         trainer: The trainer.
-        means: Positions of the splats.
+        splats: The splats.
         own: Whether they are of the scene's own points, of which some photos may show few.
     """
     scene = scene_of(trainer)
     if scene is None or (own and not scene.cloud) or not trainer.is_global_zero:
         return
     try:
-        check_cameras(scene.standard.train_cameras, means.numpy(force=True))
+        check_cameras(scene.standard.train_cameras, splats.means.numpy(force=True))
+        if not own:
+            check_colors(scene.standard, splats.means.numpy(force=True), splats.sh0.numpy(force=True))
     except ValueError as error:
         log.warning(f"the splats to start from do not fit the photos of {scene.root}: its {error}")
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -19,11 +20,12 @@ import torch
 from lightning.fabric.utilities import move_data_to_device
 from moved_scenes import write_moved
 from runs import quiet_trainer
+from scipy.spatial.transform import Rotation
 from transforms_scenes import write_blender, write_nerfstudio
 
 from nsvq_lightning.data import colmap
 from nsvq_lightning.data import scene as scene_module
-from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_models
+from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_models, read_model
 from nsvq_lightning.data.datamodule import ColmapDataModule
 from nsvq_lightning.data.images import ImageHead, Picture, same_shape
 from nsvq_lightning.data.photo_files import photos_below
@@ -32,6 +34,7 @@ from nsvq_lightning.data.reconstruct import reconstruct
 from nsvq_lightning.data.scene import (
     View,
     check_cameras,
+    check_colors,
     detailed_pixels,
     is_elsewhere,
     load_cameras,
@@ -46,6 +49,7 @@ from nsvq_lightning.io.ply import write_elements
 from nsvq_lightning.rendering.camera import Camera, camera_of
 from nsvq_lightning.rendering.frame import EXTENT, Frame
 from nsvq_lightning.rendering.poses import view_from
+from nsvq_lightning.splats.conventions import SH_C0
 from nsvq_lightning.training.module import SplatModule
 
 SceneFactory = Callable[..., Path]
@@ -431,6 +435,9 @@ def test_points_of_a_table_that_no_two_photos_saw_may_be_elsewhere(
         (root / "sparse/0/points3D.txt").write_text("".join(lines))
         scene = load_scene(root)
         assert (scene.cloud, scene.grey, is_elsewhere(scene)) == (True, False, move == "turned")
+        observations = read_model(root, observations=True).observations
+        assert observations is not None
+        assert not len(observations)  # doctor would take them for what photos share
 
 
 def test_points_that_masks_leave_out_say_nothing_of_the_others(shared_scenes: Path, tmp_path: Path) -> None:
@@ -465,6 +472,23 @@ def test_poses_that_do_not_show_the_points_of_their_model_are_told(
     assert usable(wrong) is wrong
     assert "poses from world to camera and quaternions wxyz" in caplog.text
     assert "random ones" not in caplog.text
+
+
+@pytest.mark.parametrize(("scale", "degrees", "wrong"), [(1, 0, False), (0.3, 0, True), (3, 0, True), (1, 30, True)])
+def test_splats_in_another_frame_than_the_photos_are_told_by_their_colors(
+    demo_scene: Path, monkeypatch: pytest.MonkeyPatch, scale: float, degrees: float, wrong: bool
+) -> None:
+    """As nerfstudio's and gsplat's, scaled and turned about the cameras, which then show them all the same."""
+    scene = load_scene(demo_scene)
+    sh0 = ((scene.colors - 0.5) / SH_C0)[:, None].numpy()
+    middle = np.mean([camera.packed_view[12:] for camera in scene.cameras], axis=0)
+    turn = scale * Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    means = ((scene.points.numpy() - middle) @ turn.T + middle).astype(np.float32)
+    check_cameras(scene.cameras, means)
+    check_colors(scene, means, sh0)  # few
+    monkeypatch.setattr("nsvq_lightning.data.scene._FEW_POINTS", len(means) - 1)
+    with pytest.raises(ValueError, match="not where the photos show") if wrong else contextlib.nullcontext():
+        check_colors(scene, means, sh0)
 
 
 def test_points_are_taken_where_nothing_says_that_they_are_wrong(demo_scene: Path, tmp_path: Path) -> None:
