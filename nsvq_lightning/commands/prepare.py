@@ -118,8 +118,8 @@ def _claim(options: Namespace, is_video: bool, in_place: bool) -> None:
     path = scene / reconstruct.RECORD
     found = json.loads(path.read_bytes()) if path.is_file() else None
     if found is None:
-        own = {"masks", ".DS_Store", "Thumbs.db", "desktop.ini", *(["images"] if in_place else [])}
-        if scene.is_dir() and {each.name for each in scene.iterdir()} - own:
+        own = {"masks", "Thumbs.db", "desktop.ini", *(["images"] if in_place else [])}
+        if {each.name for each in scene.glob("[!.]*")} - own:
             raise ValueError(f"{scene} is not empty and was not made by this command: name a new folder")
     elif not in_place and found.get("source") == str((scene / "images").resolve()):
         raise ValueError(f"{scene / 'images'} holds photos themselves, no copies: name a new folder for the scene")

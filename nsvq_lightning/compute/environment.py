@@ -12,6 +12,9 @@ DEFAULTS = {
     # Ask the driver whether there is a GPU: torch's own way would start CUDA, and a notebook could not fork any more.
     "PYTORCH_NVML_BASED_CUDA_CHECK": "1",
 }
+if sys.platform == "darwin":
+    # The wheels of torch and of pycolmap each bring an OpenMP, the second of which would abort the process.
+    DEFAULTS["KMP_DUPLICATE_LIB_OK"] = "TRUE"
 if sys.platform == "linux":
     # Splats grow, and with them every tensor: blocks of the old size would lie idle in a GPU's memory.
     DEFAULTS["PYTORCH_ALLOC_CONF"] = "expandable_segments:True"

@@ -284,13 +284,13 @@ def _compare(scene: Path, photos: Heads, report: Report, is_video: bool, threads
     pairs = count * (count - 1) // 2 if exhaustive else sum(max(count - step, 0) for step in STEPS)
     ended = Event()
 
+    # By COLMAP's own SQLite: Python's takes no notice of its locks, which are of the same process, and empties the
+    # index of its log, at which COLMAP crashes or loses pairs where the disk is slow.
+    database = pycolmap.Database.open(scene / DATABASE)
+
     def poll() -> None:
-        # One connection: closing it gives up COLMAP's locks, too, as both are of this process, and removes its log.
-        with closing(sqlite3.connect(scene / DATABASE)) as database:
-            while not ended.wait(timeout=1.0):
-                with suppress(sqlite3.Error):
-                    done = database.execute("select count(*) from two_view_geometries").fetchone()[0]
-                    report("comparing photos", min(done, pairs), pairs)
+        while not ended.wait(timeout=1.0):
+            report("comparing photos", min(database.num_verified_image_pairs(), pairs), pairs)
 
     polling = Thread(target=poll, daemon=True)
     polling.start()
@@ -313,6 +313,7 @@ def _compare(scene: Path, photos: Heads, report: Report, is_video: bool, threads
     finally:
         ended.set()
         polling.join()
+        database.close()
     report("comparing photos", pairs, pairs)
 
 
@@ -342,7 +343,7 @@ def _map(scene: Path, stamps: dict[str, str], report: Report, threads: int) -> l
         )
         report("placing cameras", count, count)  # those without a place, too
         ordered = _adding(found.values())
-        rmtree(work)
+        rmtree(work, ignore_errors=True)  # on exFAT, a Mac's ._files go with those that they are of
         if not ordered:
             return []
         for index, model in enumerate(ordered):
@@ -493,7 +494,8 @@ def _copy(path: Path, target: Path) -> Path:
             target = target.with_suffix(suffixes[0])
         if not in_place and target.exists():
             old, new = target.stat(), path.stat()
-            if old.st_mtime == new.st_mtime and old.st_ctime >= new.st_ctime:  # written after it was changed
+            same_size = not as_is or old.st_size == new.st_size  # on Windows, a change shows in nothing else
+            if old.st_mtime == new.st_mtime and old.st_ctime >= new.st_ctime and same_size:  # written after a change
                 return target
         image.load()
         content = path.read_bytes() if as_is else _converted(image, path, kind)
