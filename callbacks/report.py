@@ -21,7 +21,6 @@ from nsvq_lightning.training.distributed import sum_over_processes
 from nsvq_lightning.training.module import SplatModule
 from nsvq_lightning.training.run_folder import is_fast_dev_run, run_folder
 from nsvq_lightning.training.run_scene import scene_of
-from nsvq_lightning.training.stopwatch import TimesBeside
 
 from .base import WritingCallback, picture_file
 from .settings import Whole
@@ -80,11 +79,6 @@ class MetricReport(WritingCallback):
     """Write a picture of each test view."""
 
     _scene: CompressedScene | None = field(default=None, init=False)
-    _beside: TimesBeside = field(default_factory=TimesBeside, init=False)
-
-    def before_fit(self, trainer: Trainer, module: SplatModule) -> None:
-        """Forget the times of an earlier fit of this process."""
-        self._beside = TimesBeside()
 
     # During training
 
@@ -109,7 +103,7 @@ class MetricReport(WritingCallback):
             return
         loader = trainer.datamodule.val_dataloader()  # type: ignore[attr-defined]  # Lightning does not type it
         views = map(trainer.strategy.batch_to_device, loader)  # as training and validation have them
-        with module.stopwatch.paused(module.device), self._beside.timed("evaluations"):
+        with module.stopwatch.paused(module.device):
             trainer.validating = True  # for hooks that change photos in training alone
             self._evaluate(trainer, module, iteration, views)
             trainer.training = True
@@ -145,7 +139,7 @@ class MetricReport(WritingCallback):
             with optional(folder / "curve.csv") as path:
                 numbers.write_csv(path, module.history)
             with optional(folder / page.NAME):
-                page.write_page(folder, module.history, module.schedule, self._beside.seconds())
+                page.write_page(folder, module.history, module.schedule)
         values = {f"report/{name}": float(entry[name]) for name in ("psnr", "ssim", "splats")}
         trainer.callback_metrics.update({name: torch.tensor(value) for name, value in values.items()})
         for logger in trainer.loggers:
@@ -159,13 +153,12 @@ class MetricReport(WritingCallback):
         if is_fast_dev_run(trainer):
             return
         path = run_folder(trainer) / "scene.nsvq"
-        with self._beside.timed("file written and read"):
-            if trainer.is_global_zero:
-                scene = module.compressed()
-                save(scene, path, module.storage)
-                self._paper = paper_header(scene)
-            trainer.strategy.barrier("scene.nsvq")
-            self._scene = read_nsvq(path)
+        if trainer.is_global_zero:
+            scene = module.compressed()
+            save(scene, path, module.storage)
+            self._paper = paper_header(scene)
+        trainer.strategy.barrier("scene.nsvq")
+        self._scene = read_nsvq(path)
         # Detached tensors, not the module: a submodule would enter checkpoints.
         module.evaluation_splats = module.frame.splats(self._scene.decode().to(module.device))
         self._sampling = module.frame.sampling(self._scene.sampling())
@@ -216,7 +209,7 @@ class MetricReport(WritingCallback):
             paths = [picture_file(trainer, folder / "renders", score["name"]) for score in scores]
             views = [score | {"picture": path.name} for score, path in zip(scores, paths, strict=True)]
             with optional(folder / page.NAME):
-                path = page.write_page(folder, module.history, module.schedule, self._beside.seconds(), metrics, views)
+                path = page.write_page(folder, module.history, module.schedule, metrics, views)
                 log.info(f"report: {path}")
             if self.pictures:
                 pictures.log_pictures(trainer.loggers, [path for path in paths if path.exists()], trainer.global_step)

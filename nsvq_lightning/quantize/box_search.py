@@ -53,31 +53,6 @@ def sort_into_leaves(codebook: Array) -> Array:
     return order
 
 
-@parallel
-def _pack(node, _, points, order, codes, labels, leaves, nodes):
-    """Put codes and the corners of their boxes into the arrays of :func:`_boxes`."""
-    dim, count = points.shape
-    for j in range(dim):
-        node_low, node_high = F(np.inf), F(-np.inf)
-        for child in range(16):
-            leaf = node * 16 + child
-            low, high = F(np.inf), F(-np.inf)
-            for lane in range(16):
-                place = leaf * 16 + lane
-                value, label = F(np.inf), _NO_CODE
-                if place < count:
-                    label = order[place]
-                    value = points[j, label]
-                    low, high = min(low, value), max(high, value)
-                codes[leaf, j, lane] = value
-                labels[leaf, lane] = label
-            leaves[node, j, 0, child] = low
-            leaves[node, j, 1, child] = high
-            node_low, node_high = min(node_low, low), max(node_high, high)
-        nodes[node // 16, j, 0, node % 16] = node_low
-        nodes[node // 16, j, 1, node % 16] = node_high
-
-
 def _boxes(codebook: Array, order: Array) -> tuple[Array, ...]:
     """The codes in boxes, flat.
 
@@ -86,15 +61,18 @@ def _boxes(codebook: Array, order: Array) -> tuple[Array, ...]:
     """
     count, dim = codebook.shape
     nodes = -(-count // 4096) * 16
-    tree = (
-        aligned_empty((nodes * 16, dim, 16)),
-        np.empty((nodes * 16, 16), np.int32),
-        aligned_empty((nodes, dim, 2, 16)),
-        aligned_empty((nodes // 16, dim, 2, 16)),
-    )
-    points = np.ascontiguousarray(codebook.T)
+    points, labels = np.full((256 * nodes, dim), np.inf, np.float32), np.full(256 * nodes, _NO_CODE)
+    points[:count], labels[:count] = codebook[order], order
     points[np.isnan(points)] = np.inf  # where no code is chosen
-    _pack(nodes, points, order, *tree)
+    tree = [aligned_empty((16 * nodes, dim, 16)), labels]
+    tree[0][:] = points.reshape(-1, 16, dim).mT
+    low, high = points, points.copy()
+    high[count:] = -np.inf
+    for _ in range(2):  # corners of leaves, then of nodes
+        low, high = low.reshape(-1, 16, dim).min(1), high.reshape(-1, 16, dim).max(1)
+        corners = [each.reshape(-1, 16, dim).mT for each in (low, high)]
+        tree.append(aligned_empty((len(low) // 16, dim, 2, 16)))
+        np.stack(corners, axis=2, out=tree[-1])
     return tuple(array.ravel() for array in tree)
 
 

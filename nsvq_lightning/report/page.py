@@ -23,7 +23,7 @@ NAME = "report.html"
 
 
 def write_page(
-    folder: Path, history: Rows, schedule: Schedule, seconds: Values, metrics: Values | None = None, views: Rows = ()
+    folder: Path, history: Rows, schedule: Schedule, metrics: Values | None = None, views: Rows = ()
 ) -> Path:
     """Write the page of a run, atomically; without ``metrics``, browsers read it again every few seconds.
 
@@ -32,7 +32,6 @@ def write_page(
             shown where they are.
         history: The evaluations so far.
         schedule: Phases of the run.
-        seconds: Seconds that went into anything but training steps, by what it was.
         metrics: The content of ``metrics.json``, see :func:`nsvq_lightning.report.numbers.summarize`; None before it
             is known.
         views: One row for each test view, as in ``views.csv``, with ``picture``, the name of its file in ``renders/``.
@@ -50,7 +49,7 @@ def write_page(
     sections["While it trained"] = _curve(history, schedule) if history else ""
     if metrics:
         sections |= {"Bytes": _streams(metrics), "Codes": _codes(metrics)}
-    sections["Time"] = _times(history, seconds)
+    sections["Time"] = _times(history)
     if config.exists():
         text = escape(config.read_text(encoding="utf-8"))
         sections["Settings"] = f"<details><summary>config.yaml</summary><pre>{text}</pre></details>"
@@ -139,7 +138,7 @@ def _codes(metrics: Values) -> str:
     return _table(("attribute", "codebook", "in use", "entropy, bits"), rows)
 
 
-def _times(history: Rows, seconds: Values) -> str:
+def _times(history: Rows) -> str:
     """The table of times."""
     rows = []
     before, since = 0, 0.0
@@ -148,7 +147,6 @@ def _times(history: Rows, seconds: Values) -> str:
         taken = last["seconds"] - since
         rows.append((last["phase"], f"{steps:,}", _duration(taken), f"{1000 * taken / steps:.1f}"))
         before, since = last["iteration"], last["seconds"]
-    rows += [(name, "", _duration(taken), "") for name, taken in seconds.items() if taken]
     return _table(("part", "iterations", "time", "ms each"), rows)
 
 

@@ -1,7 +1,6 @@
-"""What a run spends its time on: training, without pauses and the compilation of kernels, and all else."""
+"""How long a run trains, without pauses and the compilation of kernels."""
 
 import time
-from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -49,25 +48,6 @@ class Stopwatch:
             if running:
                 torch.get_device_module(device).synchronize()
                 self.start()
-
-
-class TimesBeside:
-    """Seconds that went into anything but training steps, by what it was."""
-
-    def __init__(self) -> None:
-        self._compiled_before = compile_seconds()
-        self._seconds = defaultdict[str, float](float)
-
-    @contextmanager
-    def timed(self, part: str) -> Iterator[None]:
-        """Add the time of the body to a part."""
-        start = time.perf_counter()
-        yield
-        self._seconds[part] += time.perf_counter() - start
-
-    def seconds(self) -> dict[str, float]:
-        """Seconds by part, and those in which kernels were compiled."""
-        return {"kernels compiled": compile_seconds() - self._compiled_before, **self._seconds}
 
 
 def _working_time() -> float:

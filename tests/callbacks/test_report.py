@@ -74,16 +74,3 @@ def test_a_data_module_without_a_scene_has_no_curve() -> None:
     module = SplatModule()
     MetricReport().on_fit_end(trainer, module)
     assert module.history == []
-
-
-def test_the_times_of_a_second_run_are_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    report, seconds = MetricReport(), [40.0]
-    monkeypatch.setattr("nsvq_lightning.training.stopwatch.compile_seconds", lambda: seconds[0])
-    nobody: Any = None
-    for compiled in (40.0, 2.0):
-        report.before_fit(nobody, nobody)
-        with report._beside.timed("evaluations"):
-            seconds[0] += compiled
-        told = report._beside.seconds()
-        assert told["kernels compiled"] == compiled
-        assert told["evaluations"] < 1

@@ -93,7 +93,7 @@ def _picture(address: str) -> Any:
 
 
 def test_page_of_a_finished_run_needs_no_other_file(run: Path) -> None:
-    path = write_page(run, HISTORY, SCHEDULE, {"evaluations": 12.0, "kernels compiled": 0.0}, METRICS, VIEWS)
+    path = write_page(run, HISTORY, SCHEDULE, METRICS, VIEWS)
     text = path.read_text(encoding="utf-8")
     page = Tags(text)
     assert "http-equiv" not in text
@@ -110,12 +110,12 @@ def test_page_of_a_finished_run_needs_no_other_file(run: Path) -> None:
     assert same[2].max() < 8
     for words in ("a & <i> / version_0", "31.25 dB", "0.004 MB", "41.5 x", "a.jpg: 30.00 dB, SSIM 0.8000, the lowest"):
         assert words in page.words
-    for words in ("sub/<b>.jpg: 32.50 dB", "model: {note: '</pre><script>'}", "evaluations"):
+    for words in ("sub/<b>.jpg: 32.50 dB", "model: {note: '</pre><script>'}"):
         assert words in page.words
     for row in (r"means +3,500 +28\.00", r"quats +64 +40 +5\.12", r"warmup +150 +7\.5 s +50\.0"):
         assert re.search(row, page.words)
     assert re.search(r"finetune +300 +1 min 0 s +200\.0", page.words)
-    assert not re.search(r"means\.far|kernels compiled", page.words)
+    assert not re.search(r"means\.far", page.words)
     places = [text.index(words) for words in ("31.25 dB", 'class="views"', 'id="curve"', "<table>", "config.yaml")]
     assert places == sorted(places)
     curve = json.loads(text.split("const trained = ")[1].split(";</script>")[0])
@@ -126,7 +126,7 @@ def test_page_of_a_finished_run_needs_no_other_file(run: Path) -> None:
 @needs_chromium
 def test_page_fits_a_phone_and_its_pictures_slide(run: Path, tmp_path: Path) -> None:
     history = [*HISTORY, _entry(451, "finetune", math.inf, 68.0)]
-    path = write_page(run, history, SCHEDULE, {"kernels compiled": 1234.5}, METRICS, VIEWS)
+    path = write_page(run, history, SCHEDULE, METRICS, VIEWS)
     with chromium(tmp_path / "profile") as tab:
         tab.open(path.as_uri(), 390, 844, mobile=True)
         tab.run("new Promise(resolve => requestAnimationFrame(() => setTimeout(resolve)))")  # the curve is drawn
@@ -148,7 +148,7 @@ def test_page_fits_a_phone_and_its_pictures_slide(run: Path, tmp_path: Path) -> 
 
 def test_page_of_a_running_fit_shows_a_view_and_is_read_again(run: Path) -> None:
     write_png(run / "preview.png", torch.cat([torch.zeros(20, 1100, 3), torch.ones(20, 1100, 3)], dim=1))
-    text = write_page(run, HISTORY[:2], SCHEDULE, {}).read_text(encoding="utf-8")
+    text = write_page(run, HISTORY[:2], SCHEDULE).read_text(encoding="utf-8")
     tags = Tags(text)
     assert '<meta http-equiv="refresh" content="5">' in text
     assert "150 of 450" in tags.words
@@ -178,7 +178,7 @@ def test_a_measurement_waits_for_no_other_process(demo_scene: Path, monkeypatch:
 
 def test_of_many_views_the_page_has_the_lowest(run: Path) -> None:
     views = [VIEWS[0] | {"name": f"{number:03d}.jpg", "psnr": 20.0 + number % 53} for number in range(53)]
-    text = write_page(run, HISTORY, SCHEDULE, {}, METRICS, views).read_text()
+    text = write_page(run, HISTORY, SCHEDULE, METRICS, views).read_text()
     assert "The 50 lowest of 53" in text
     assert [f"{number:03d}.jpg" in text for number in (0, 49, 50, 52)] == [True, True, False, False]
     assert text.count(", the lowest") == 1
@@ -187,5 +187,5 @@ def test_of_many_views_the_page_has_the_lowest(run: Path) -> None:
 def test_a_picture_that_is_none_any_more_is_named(run: Path) -> None:
     (run / "renders" / "a.png").write_bytes(b"nothing")
     with pytest.raises(OSError, match=r"a\.png is not a picture any more; run 'nsvq test' again"):
-        write_page(run, HISTORY, SCHEDULE, {}, METRICS, VIEWS)
+        write_page(run, HISTORY, SCHEDULE, METRICS, VIEWS)
     assert not (run / "report.html").exists()

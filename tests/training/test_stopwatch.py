@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nsvq_lightning.training.stopwatch import Stopwatch, TimesBeside
+from nsvq_lightning.training.stopwatch import Stopwatch
 
 
 @pytest.fixture
@@ -54,11 +54,3 @@ def test_a_pause_ends_where_its_body_fails(now: list[float]) -> None:
     now[0] = 5.0
     watch.stop()
     assert watch.seconds == 2.0
-
-
-def test_what_is_done_twice_is_added_up(now: list[float]) -> None:
-    times = TimesBeside()
-    for seconds in (2.0, 3.0):
-        with times.timed("evaluations"):
-            now[0] += seconds
-    assert times.seconds()["evaluations"] == 5.0
