@@ -1,19 +1,28 @@
-"""What the package has at its top level: its logger, and folders that stand beside it in the repository.
+"""What any room may need: the logger, commands that are said, and folders that stand beside the package.
 
 An installed package contains these folders, and in a checkout, symbolic links lead to them. Where git cannot create
 links, as on Windows, it writes small text files instead; this module then finds the folders at the top level.
 """
 
 import logging
+import os
+import shlex
 import sys
+from collections.abc import Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
+from subprocess import list2cmdline
 from types import ModuleType
 from typing import Any
 
 log = logging.getLogger("nsvq_lightning")
 _PACKAGE = Path(__file__).parent
+
+
+def join(words: Sequence[str]) -> str:
+    """A command for the shell of this system; that of Windows knows no single quotes."""
+    return list2cmdline(words) if os.name == "nt" else shlex.join(words)
 
 
 def folder_of(name: str) -> Path:

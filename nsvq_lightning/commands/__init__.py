@@ -1,14 +1,10 @@
 """The commands that may follow ``nsvq``. Light: it imports no heavy modules."""
 
-import os
-import shlex
 import sys
 from collections.abc import Collection, Iterable, Sequence
 from difflib import get_close_matches
-from subprocess import list2cmdline
 
-# A command for the shell of this system; that of Windows knows no single quotes.
-join = list2cmdline if os.name == "nt" else shlex.join
+from nsvq_lightning.top_level import join as join
 
 # What each command does. It is the module of its name that does it, see
 # :func:`~nsvq_lightning.commands.main.run_command`, or Lightning.

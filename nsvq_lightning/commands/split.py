@@ -62,10 +62,10 @@ def run(options: Namespace) -> None:
     try:
         counts = write_blocks(scene, blocks, folders)
     except BaseException:
-        rmtree(options.output)  # so that the command can be given again
+        rmtree(options.output, ignore_errors=True)  # so that the command can be given again
         raise
     for folder, (train, test) in zip(folders, counts, strict=True):
         sys.stderr.write(f"{folder}: {train} train and {test} test photos\n")
-        root = folder.resolve()
-        ends = [f"--data.root={root}", f"--trainer.run_folder={root / RUN}", *AS_WRITTEN * bool(read)]
+        root = folder.resolve().as_posix()  # which every shell takes
+        ends = [f"--data.root={root}", f"--trainer.run_folder={root}/{RUN}", *AS_WRITTEN * bool(read)]
         say(join(["nsvq", "fit", *behind, *options.further, *ends]))

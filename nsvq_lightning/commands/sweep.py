@@ -10,7 +10,6 @@ Examples:
 
 import json
 import re
-import signal
 import subprocess
 import sys
 from argparse import ArgumentParser, Namespace
@@ -226,9 +225,9 @@ def prepare(run: Run) -> list[str]:
             write_text(config, run.config)  # a run that has begun notes there how many iterations its minutes are
     finally:
         let_go(run.folder)
-    arguments = ["fit", "--config", str(config), f"--trainer.run_folder={run.folder}"]
+    arguments = ["fit", "--config", config.as_posix(), f"--trainer.run_folder={run.folder.as_posix()}"]
     if begun:
-        arguments.append(f"--ckpt_path={run.folder / CHECKPOINT}")
+        arguments.append(f"--ckpt_path={(run.folder / CHECKPOINT).as_posix()}")
     return arguments
 
 
@@ -278,7 +277,7 @@ def train(run: Run) -> str:
     if status == 0:
         return "" if run.is_finished else f"the run has left no metrics.json: callbacks.report must stay (see {said})"
     if status < 0:
-        guess = ", perhaps for want of memory" if status == -signal.SIGKILL else ""
+        guess = ", perhaps for want of memory" if status == -9 else ""
         return f"killed by signal {-status}{guess} (see {said})"
     text = said.read_text(encoding="utf-8", errors="replace").strip()
     errors = re.findall(r"^error: (.+)$", text, re.MULTILINE)

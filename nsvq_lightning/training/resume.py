@@ -1,7 +1,6 @@
 """Checkpoints that continue a run: read, checked, and never trusted to import anything."""
 
 import re
-import shlex
 import sys
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, is_dataclass, replace
@@ -22,7 +21,7 @@ from nsvq_lightning.data.scene import Scene
 from nsvq_lightning.io.atomic import StrPath, make_folder_of, write_bytes
 from nsvq_lightning.io.errors import FormatError, Json
 from nsvq_lightning.splats.splats import sh_degree_of
-from nsvq_lightning.top_level import log
+from nsvq_lightning.top_level import join, log
 from nsvq_lightning.training.schedule import Schedule
 
 # Of a checkpoint, or of a part of one, by their names.
@@ -59,7 +58,7 @@ def changes(checkpoint: Values, schedule: Schedule, own: Values) -> str:
         for name, value in stored.items()
         if here.get(name, value) != value and name not in ("saved", "init_from")
     ]
-    return shlex.join(changed).replace("callbacks.phases.total", "trainer.max_steps")
+    return join(changed).replace("callbacks.phases.total", "trainer.max_steps")
 
 
 def check_continuation(checkpoint: Values, own: Mapping[str, Tensor], quantizers: Mapping[str, Values]) -> None:
