@@ -329,18 +329,20 @@ def splats_for_bytes(
     """
     usual = Precision()
     position, opacity = precision.position / usual.position, precision.opacity / usual.opacity
-    fixed = 8 * 2048.0  # the header
     # Position and opacity of a splat take 22 to 25 bits on the measured scenes.
-    bits = 23.5 - 3 * math.log2(position) - math.log2(opacity)
+    bits = 23.5 - math.log2(position**3 * opacity)
     # What remains of codes and codebooks where codes are chosen by rate and distortion, as measured.
     coded = 1 / (1 + 0.25 * strength)
-    # A number without a codebook takes 5.8 to 7.6 bits after 2500 iterations, one of shN 2.8 to 3, as measured.
-    bits += sum((6, 3)[name == "shN"] * attribute_dims(sh_degree)[name] for name in QUANTIZABLE if name not in books)
+    # A number without a codebook takes 5.8 to 7.6 bits after 2500 iterations, one of shN 2.8 to 3, as measured; with an
+    # error from 8 times as large to a 16th, the logarithm is right to a quarter of a bit.
+    for name in QUANTIZABLE:
+        levels = 1 + (63, 7)[name == "shN"] * usual.of(name) / precision.of(name)
+        bits += (name not in books) * math.log2(levels) * attribute_dims(sh_degree)[name]
     splats = size
-    for _ in range(8):  # codebooks depend on the splats, and these on what codebooks leave
+    for _ in range(8):  # codebooks depend on the splats, and these on what codebooks and the header, 2 KB, leave
         placed = {name: (min(count, max(1.0, most * splats / dim)), dim) for name, (count, dim) in books.items()}
         all_books, codes = codebook_bits(placed)
-        splats = max(1, int((8 * size - fixed - coded * all_books) / (bits + coded * codes)))
+        splats = max(1, int((8 * (size - 2048) - coded * all_books) / (bits + coded * codes)))
     if splats < MIN_BUDGET:
         raise ValueError(f"{size} bytes leave no room beside codebooks: allow more, or --model.codebooks=0.5k")
     return splats

@@ -68,7 +68,8 @@ def perplexity(usage: Tensor) -> float:
 class CodebookInit(SplatCallback):
     """At the first iteration of the quantize phase, fit every codebook to the rows of all splats (k-means).
 
-    NaN and infinite splats are dropped first, whenever they were last searched for.
+    NaN and infinite splats are dropped first, whenever they were last searched for. A run with codebooks cannot do
+    without it: leave out both, with ``--model.codebooks=null``.
     """
 
     weighted: bool = True
@@ -209,10 +210,10 @@ def _sum_usage(trainer: Trainer, quantizer: Quantizer) -> None:
 
 
 class CodebookRefit(SplatCallback):
-    """Refits codebooks to the rows of all splats in the quantize phase, as CompGS does (Navaneet et al. 2024).
+    """Refits codebooks of ``StraightThrough`` to all splats in the quantize phase, as CompGS (Navaneet et al. 2024).
 
-    Only quantizers that have a method ``refit``, such as ``StraightThrough``, are refitted. CompGS runs up to 10 steps
-    of k-means every 100 iterations.
+    Only quantizers that have a method ``refit`` are refitted; the default one has none, and nothing happens. CompGS
+    runs up to 10 steps of k-means every 100 iterations.
 
     A refit comes between backward pass and update: once a step, also with gradient accumulation, and before other
     callbacks replace codes or evaluate, so the order of the callbacks does not matter.
@@ -429,7 +430,7 @@ class FreezeCodes(SplatCallback):
             if not getattr(quantizer, "fitted", True):
                 raise RuntimeError(
                     f"iteration {trainer.global_step + 1}: the codebook of {name} has never been placed, so its codes "
-                    "cannot be frozen; add CodebookInit to the callbacks"
+                    "cannot be frozen; begin again with CodebookInit, or --model.codebooks=null"
                 )
             quantizer.freeze(distributed.from_first_process(trainer, codes))
         distributed.check_replicas(trainer, "freezing the codes")

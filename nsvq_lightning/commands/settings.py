@@ -56,7 +56,7 @@ def expand(arguments: Sequence[str]) -> list[str]:
         name = option.removeprefix("--")
         if argument.startswith(CONFIG):
             expanded.append(f"{CONFIG}{find_config(value)}")
-        elif not option.startswith("--") or name not in SHORTHANDS:
+        elif not option.startswith("--") or name not in SHORTHANDS or arguments[0] == "export":
             expanded.append(argument)
         elif name != "minutes" and size not in (None, name):
             raise ValueError(f"--{size} and --{name} both say how large the scene is to be: give one of them")

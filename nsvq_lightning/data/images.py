@@ -114,7 +114,9 @@ def _undecodable(path: Path, reason: str) -> SceneError:
     with suppress(OSError), path.open("rb") as file:
         if file.read(len(LFS)) == LFS:
             reason = POINTER
-    return SceneError(f"image {path} cannot be decoded ({reason}): copy it again, or remove it and run COLMAP again")
+    return SceneError(
+        f"image {path} cannot be decoded ({reason}): copy it again, or remove it, and run COLMAP again if it is a photo"
+    )
 
 
 def read_image(path: Path) -> Uint8s:
@@ -175,7 +177,7 @@ def _decoded(path: Path, flags: int) -> Arrays:
         reason = f"truncated, damaged, too large or of an unknown format, {len(data)} bytes: {error}"
         raise _undecodable(path, reason) from error
     if image.dtype not in (np.uint8, np.uint16):
-        raise _undecodable(path, f"its pixels are {image.dtype}; accepted are 8 and 16 bit integers")
+        raise _undecodable(path, f"its pixels are {image.dtype}: save 8 or 16 bit integers, a mask in 0 and 255")
     return _turned_back(image, applied)
 
 

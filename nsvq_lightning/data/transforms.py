@@ -163,7 +163,7 @@ class _Frame(NamedTuple):
             distorted = f" and k4 = {k4:g}" if model in _PERSPECTIVE else ""
             raise self.error(
                 f"has camera_model {model}{distorted}, which cannot be read; PINHOLE, OPENCV (k1 to k3, p1, p2) and "
-                "OPENCV_FISHEYE (k1 to k4) can",
+                "OPENCV_FISHEYE (k1 to k4, no p1 and p2) can",
                 PANORAMA if model in ("EQUIRECTANGULAR", "LATLONG") else "export the photos undistorted, as PINHOLE",
             )
         distortion = (k1, k2, p1, p2, k3)

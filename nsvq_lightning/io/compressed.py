@@ -155,6 +155,8 @@ class CompressedScene:
             raise ValueError(f"the splats have no {', '.join(sorted(missing))}")
         if "features_dc" in given and not rows.get("shN", rows["sh0"]).size:  # nerfstudio's of degree 0: logits
             rows["sh0"] = 0.5 * np.tanh(0.5 * rows["sh0"]) / conventions.SH_C0
+        if "shN" in rows and rows["shN"].shape[2:] != (3,):
+            raise ValueError(f"shN must have shape [N, (degree + 1)^2 - 1, 3], got {list(rows['shN'].shape)}")
         warn_of_activations(rows["opacities"], rows["scales"])
         return cls.from_rows(rows, **header)
 
@@ -174,8 +176,6 @@ class CompressedScene:
         if antialiased:
             header["config"] = {"antialiased": True}
         found = {"shN": np.zeros((len(rows["means"]), 0), np.float32)}
-        if "shN" in rows and rows["shN"].ndim == 3 and rows["shN"].shape[2] != 3:
-            raise ValueError(f"shN must have shape [N, (degree + 1)^2 - 1, 3], got {list(rows['shN'].shape)}")
         for name, values in rows.items():
             found[name] = np.ascontiguousarray(values, np.float32).reshape(len(values), math.prod(values.shape[1:]))
         # Opacities of exactly 0 and 1 are infinite logits, lengths of 0 logarithms of -inf.

@@ -66,12 +66,13 @@ def read_splat(path: StrPath) -> CompressedScene:
     """Read a ``.splat`` file.
 
     Raises:
-        FormatError: The file does not consist of whole splats.
+        FormatError: The file does not consist of whole splats, or begins as one of another format does.
     """
     data = Path(path).read_bytes()
     with naming_file(path):
-        if len(data) % (each := _RECORD.itemsize):
-            raise FormatError(f"truncated, or not a .splat file: {len(data)} bytes are not whole splats of {each}")
+        # The format has no mark of its own; those of others are no coordinate of a splat.
+        if len(data) % _RECORD.itemsize or data[:4] in b"ply\n ply\r PK\3\4 \x1f\x8b\x08\0 NGSP \x89NSV glTF #usd":
+            raise FormatError(f"truncated, or not a .splat file: {len(data)} bytes, {data[:4]!r}…, are no splats of 32")
     records = np.frombuffer(data, _RECORD)
     colors = records["colors"]
     return CompressedScene.from_rows(

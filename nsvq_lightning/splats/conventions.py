@@ -79,12 +79,12 @@ def unit(quats: Float32s) -> Float64s:
 
 
 def turned(quats: Float32s, rotation: Float64s) -> Float32s:
-    """Quaternions wxyz ``[N, 4]`` after all axes have turned by a rotation ``[3, 3]``; lengths stay."""
+    """Quaternions wxyz ``[N, 4]`` after all axes have turned by a rotation ``[3, 3]``, of length 1."""
     from scipy.spatial.transform import Rotation  # slow to import, and few files are turned
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()
     product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return np.asarray(quats.astype(np.float64) @ product.T, np.float32)
+    return np.asarray(unit(quats) @ product.T, np.float32)
 
 
 def smallest_three(units: Float64s) -> tuple[NDArray[np.intp], Float64s]:

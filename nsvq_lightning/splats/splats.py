@@ -289,7 +289,7 @@ def canonical(scales: Tensor, quats: Tensor) -> Canonical:
 
     Args:
         scales: Log-scales ``[N, 3]``.
-        quats: Quaternions ``[N, 4]``, wxyz, any length.
+        quats: Quaternions ``[N, 4]``, wxyz, of any length up to 1e19.
     """
     squared = quats.square().sum(1, keepdim=True)
     directed = ~(squared < MIN_SQUARED_NORM)

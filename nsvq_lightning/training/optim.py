@@ -115,14 +115,16 @@ def adapt_to_views(optimizer: Optimizer, rates: LearningRates, views: int) -> fl
         By what the learning rates of such a step are multiplied.
 
     Raises:
-        ValueError: So many views that a beta would not be positive.
+        ValueError: No views, or so many that a beta would not be positive.
     """
     scale = views if rates.scale_with_views else 1
     betas = tuple(1 - scale * (1 - beta) for beta in (0.9, 0.999))
-    if min(betas) <= 0:
+    if min(*betas, views) <= 0:
         raise ValueError(
-            f"rates cannot scale with {views} views a step, as Adam's first beta would be {betas[0]:.2g}: train fewer "
-            "at once, or leave --model.rates.scale_with_views off"
+            f"cannot train on {views} views a step, as Adam's first beta would be {betas[0]:.2g}: train fewer at once, "
+            "or leave --model.rates.scale_with_views off"
+            if views > 0
+            else f"{views} views a step: accumulate_grad_batches must be above 0"
         )
     for group in optimizer.param_groups:
         group["betas"], group["eps"] = betas, EPS / math.sqrt(scale)

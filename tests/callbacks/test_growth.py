@@ -255,6 +255,19 @@ def test_a_budget_is_needed_and_the_modules_is_taken() -> None:
     assert growth.limit(stage.module) == 100
 
 
+# Attribute, its numbers of a splat, its error over the usual one, and the bits of each number that this costs.
+FINER_NUMBERS = [
+    ("scales", 3, 1 / 16, 4.0),
+    ("quats", 4, 1 / 4, 2.0),
+    ("sh0", 3, 1 / 8, 2.99),
+    ("sh0", 3, 8, -2.63),
+    ("shN", 45, 1 / 16, 3.81),
+    ("shN", 45, 1 / 2, 0.88),
+    ("shN", 45, 2, -0.76),
+    ("shN", 45, 8, -1.96),
+]
+
+
 def test_a_budget_in_bytes_knows_that_codebooks_are_smaller_where_splats_are_few() -> None:
     books = {"scales": (8192, 3), "quats": (8192, 4), "sh0": (2048, 3), "shN": (2048, 45)}
 
@@ -269,4 +282,9 @@ def test_a_budget_in_bytes_knows_that_codebooks_are_smaller_where_splats_are_few
     # As measured: fox, bonsai and horns in fast.yaml, at a half or a quarter of their size, without codebooks.
     for size, count in ((540_643, 20_353), (329_825, 12_057), (134_115, 4_643)):
         assert splats_for_bytes(size, {}, 3, Precision(), 0.0, math.inf) == pytest.approx(count, rel=0.1)
+    # As measured: bits by which a number of the demo scene grows in a file with other errors.
+    for name, values, factor, more in FINER_NUMBERS:
+        precision = replace(Precision(), **{name: factor * Precision().of(name)})
+        bits = [8e9 / splats_for_bytes(10**9, {}, 3, each, 0.0, math.inf) for each in (precision, Precision())]
+        assert (bits[0] - bits[1]) / values == pytest.approx(more, abs=0.3), (name, factor)
     assert splats(1_440_071, 0.6) == splats(1_440_071, math.inf) == pytest.approx(167_805, rel=0.1)

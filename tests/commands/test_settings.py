@@ -164,3 +164,9 @@ def test_options_of_another_lightning_are_left_to_its_parser(
 def test_the_stored_help_is_of_the_versions_that_were_tested() -> None:
     pins = (Path(__file__).parents[2] / "constraints.txt").read_text(encoding="utf-8").splitlines()
     assert {f"{name}=={version}" for name, version in settings.FIT_HELP_OF.items()} <= set(pins)
+
+
+def test_export_has_no_short_options_of_a_fit() -> None:
+    """They went to callbacks that an export does not ask: all splats were written, without a word."""
+    arguments = ["export", "--ckpt_path=last.ckpt", "--splats=1000", "--minutes=3"]
+    assert expand(arguments) == arguments  # which its parser refuses

@@ -124,3 +124,17 @@ def test_opacities_of_0_and_1_and_no_length_are_numbers(tmp_path: Path) -> None:
     assert scene.raw["scales"][3, 2] == -20
     save(scene, tmp_path / "x.nsvq")
     assert len(read_scene(tmp_path / "x.nsvq")) == 20
+
+
+@pytest.mark.parametrize("width", [0, 45])
+def test_flat_harmonics_are_refused_as_their_order_is_unknown(width: int, tmp_path: Path) -> None:
+    """gsplat and INRIA flatten [N, 3, C]; read as [N, C, 3], the colours were others, without a word."""
+    tensors = {**flat_splats(), "shN": torch.zeros(5, width)}
+    with pytest.raises(ValueError, match=rf"shN must have shape \[N, .*, 3\], got \[5, {width}\]"):
+        save(tensors, tmp_path / "scene.ply")
+
+
+def flat_splats() -> dict[str, torch.Tensor]:
+    """Five splats of degree 0."""
+    shapes = {"means": (5, 3), "quats": (5, 4), "scales": (5, 3), "opacities": (5,), "sh0": (5, 1, 3)}
+    return {name: torch.randn(shape) for name, shape in shapes.items()}

@@ -206,3 +206,15 @@ def test_splats_without_a_rotation_are_counted(tmp_path: Path, caplog: pytest.Lo
 def test_what_turns_other_files_into_some_that_are_read_is_said(name: str, way: str) -> None:
     with pytest.raises(ValueError, match=rf"unknown suffix .*; .*{way}"):
         read_scene(name)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".nsvq", ".glb", ".usda"])
+def test_a_file_of_another_format_is_no_splat_file(suffix: str, tmp_path: Path) -> None:
+    """It has no mark of its own: one in 32 of them was read as splats of random numbers."""
+    path = tmp_path / f"scene{suffix}"
+    save(plain_scene(40), path)
+    content = path.read_bytes()
+    renamed = tmp_path / "scene.splat"
+    renamed.write_bytes(content + bytes(-len(content) % 32))
+    with pytest.raises(FormatError, match=r"not a \.splat file: .* are no splats of 32"):
+        load(renamed)

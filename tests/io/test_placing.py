@@ -57,6 +57,17 @@ def test_a_turned_scene_is_the_same_scene(degree: int, kind: str) -> None:
     torch.testing.assert_close(picture(turned, after), expected, rtol=0, atol=2e-5)
 
 
+def test_splats_without_a_rotation_turn_with_the_others() -> None:
+    """The renderer takes 0 0 0 0 for the identity; its product with a rotation is 0 0 0 0 again."""
+    rotation = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    found = []
+    for w in (0.0, 1.0):
+        scene = ball(20, 1)
+        scene.raw["quats"][:] = [w, 0, 0, 0]
+        found.append(rotated(scene, rotation).values("quats"))
+    np.testing.assert_array_equal(*found)
+
+
 def test_a_scene_keeps_its_detail_on_a_map() -> None:
     scene = ball(200)
     shift = np.array([4.1e6, 6.3e5, 4.8e6])

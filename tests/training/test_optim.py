@@ -120,3 +120,11 @@ def test_a_codebook_without_gradient_is_left_alone() -> None:
 def test_impossible_rates_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"rate {next(iter(bad))} must be finite"):
         LearningRates(**bad)
+
+
+@pytest.mark.parametrize("views", [0, -1])
+def test_a_step_of_no_views_is_refused(views: int) -> None:
+    """With -1 accumulated batches the loss went up, without a word; with 0, Lightning divided by 0."""
+    optimizer = build_adam(param_groups(Splats(0), {}, LearningRates(), 1.0))
+    with pytest.raises(ValueError, match=rf"{views} views a step: accumulate_grad_batches must be above 0"):
+        adapt_to_views(optimizer, LearningRates(), views)
