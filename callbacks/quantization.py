@@ -328,7 +328,8 @@ class RateDistortion(SplatCallback):
             for name, total in shown.items():
                 total += getattr(squares, name).flatten(1).mean(1)
         error = distributed.sum_over_processes(trainer, error)
-        a_bit = self.strength * float(error) / (BITS_A_SPLAT * len(module.splats))
+        # In four digits: the last ones of a sum depend on the number of threads.
+        a_bit = self.strength * float(f"{error:.4g}") / (BITS_A_SPLAT * len(module.splats))
         self.prices = {}
         for name, total in shown.items():
             self.prices[name] = a_bit / row_weights(distributed.sum_over_processes(trainer, total), MIN_SENSITIVITY)
