@@ -237,7 +237,7 @@ def _run_lightning(arguments: list[str], own_process: bool) -> int:
             sys.stderr.write(f"Settings came from {', '.join(configs)} and the command line\n")
         raise
     except Exception as error:
-        names_file = isinstance(error, FileNotFoundError) or (isinstance(error, OSError) and error.filename is not None)
+        names_file = isinstance(error, FileNotFoundError) or (isinstance(error, OSError) and error.errno)
         speaks = names_file or isinstance(error, MisconfigurationException) or _is_ours(error)
         if os.environ.get(TRACEBACK) or not speaks:
             raise

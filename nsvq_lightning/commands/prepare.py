@@ -48,6 +48,7 @@ def run(options: Namespace) -> int:
     from nsvq_lightning.data import reconstruct
     from nsvq_lightning.data.images import ON_ITS_SIDE, image_head
     from nsvq_lightning.data.transforms import has_poses
+    from nsvq_lightning.training.run_folder import hold
 
     source, scene = options.source, options.scene
     if not source.exists():
@@ -60,6 +61,7 @@ def run(options: Namespace) -> int:
     images = scene / "images"
     in_place = source.resolve() == images.resolve()
     _claim(options, is_video, in_place)
+    hold(scene)
     bars = {}
 
     def report(step: str, done: int, total: int) -> None:

@@ -4,7 +4,6 @@ Errors are ``ValueError`` without the name of the file. Text tables are read mor
 spaces, images without a second line, colours of any kind, points without identifier, error and track.
 """
 
-import mmap
 import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
@@ -134,7 +133,7 @@ _IMAGE = struct.Struct("<I7dI")  # identifier, pose, camera; the name and the 2D
 _POINT = struct.Struct("<Q3d3BdQ")  # identifier, position, colour, error, length of the track, which follows
 
 
-def _records(path: Path, record: Callable[[mmap.mmap, int], tuple[_Row, int]]) -> Iterator[_Row]:
+def _records(path: Path, record: Callable[[bytes, int], tuple[_Row, int]]) -> Iterator[_Row]:
     """The records of a binary table, none of which may end beyond the file.
 
     Args:
@@ -144,30 +143,30 @@ def _records(path: Path, record: Callable[[mmap.mmap, int], tuple[_Row, int]]) -
     Raises:
         ValueError: The file is empty, truncated, or longer than its records.
     """
-    size = path.stat().st_size
+    data = path.read_bytes()  # not mapped: an error of the disk would end the process, and some disks map nothing
+    size = len(data)
     if size < _U64.size:
         raise ValueError(f"it has {size} bytes, too few for a COLMAP table")
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        if data[: len(LFS)] == LFS:
-            raise ValueError(f"it is {POINTER}")
-        (count,) = _U64.unpack_from(data, 0)
-        end = _U64.size
-        for row in range(1, count + 1):
-            try:
-                values, end = record(data, end)
-                if end > size:
-                    raise struct.error("it ends beyond the file")
-            except struct.error as error:
-                raise ValueError(
-                    f"it is truncated or garbled: of {count} declared records, record {row} cannot be read ({error}; "
-                    f"the file has {size} bytes)"
-                ) from error
-            yield values
-        if end != size:
-            raise ValueError(f"it is garbled: its {count} declared records end at byte {end} of {size}")
+    if data[: len(LFS)] == LFS:
+        raise ValueError(f"it is {POINTER}")
+    (count,) = _U64.unpack_from(data, 0)
+    end = _U64.size
+    for row in range(1, count + 1):
+        try:
+            values, end = record(data, end)
+            if end > size:
+                raise struct.error("it ends beyond the file")
+        except struct.error as error:
+            raise ValueError(
+                f"it is truncated or garbled: of {count} declared records, record {row} cannot be read ({error}; "
+                f"the file has {size} bytes)"
+            ) from error
+        yield values
+    if end != size:
+        raise ValueError(f"it is garbled: its {count} declared records end at byte {end} of {size}")
 
 
-def _camera_record(data: mmap.mmap, start: int) -> tuple[CameraRow, int]:
+def _camera_record(data: bytes, start: int) -> tuple[CameraRow, int]:
     number, model, width, height = _CAMERA.unpack_from(data, start)
     if not 0 <= model < len(LENSES):
         raise struct.error(
@@ -178,7 +177,7 @@ def _camera_record(data: mmap.mmap, start: int) -> tuple[CameraRow, int]:
     return CameraRow(number, name, width, height, params), start + _CAMERA.size + 8 * count
 
 
-def _image_record(data: mmap.mmap, start: int) -> tuple[ImageRow, int]:
+def _image_record(data: bytes, start: int) -> tuple[ImageRow, int]:
     number, *pose, camera_id = _IMAGE.unpack_from(data, start)
     end = data.find(b"\0", start + _IMAGE.size)
     if end < 0:
@@ -188,7 +187,7 @@ def _image_record(data: mmap.mmap, start: int) -> tuple[ImageRow, int]:
     return ImageRow(number, tuple(pose), camera_id, name), end + 1 + _U64.size + 24 * points
 
 
-def _point_record(data: mmap.mmap, start: int, tracks: bool) -> tuple[_Point, int]:
+def _point_record(data: bytes, start: int, tracks: bool) -> tuple[_Point, int]:
     *values, _, length = _POINT.unpack_from(data, start)
     first = start + _POINT.size
     end = first + 8 * length

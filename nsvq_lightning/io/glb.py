@@ -103,6 +103,8 @@ def write_glb(path: StrPath, scene: CompressedScene) -> int:
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     total = _HEAD.size + len(text) + _CHUNK.size + end
+    if total >> 32:  # lengths have 32 bits
+        raise ValueError(f"{path}: {total} bytes are more than a .glb can have: write .ply, .nsvq or .spz")
     with atomic_write(path) as file:
         file.write(_HEAD.pack(b"glTF", 2, total, len(text), b"JSON") + text + _CHUNK.pack(end, b"BIN\0"))
         for values in arrays.values():

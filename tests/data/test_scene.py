@@ -27,7 +27,7 @@ from nsvq_lightning.data import colmap
 from nsvq_lightning.data import scene as scene_module
 from nsvq_lightning.data.colmap import SceneError, import_pycolmap, larger_models, read_model
 from nsvq_lightning.data.datamodule import ColmapDataModule
-from nsvq_lightning.data.images import ImageHead, Picture, same_shape
+from nsvq_lightning.data.images import ImageHead, ImageStore, Picture, same_shape
 from nsvq_lightning.data.photo_files import photos_below
 from nsvq_lightning.data.points import RANDOM_POINTS, in_picture, projected
 from nsvq_lightning.data.reconstruct import reconstruct
@@ -489,6 +489,19 @@ def test_splats_in_another_frame_than_the_photos_are_told_by_their_colors(
     monkeypatch.setattr("nsvq_lightning.data.scene._FEW_POINTS", len(means) - 1)
     with pytest.raises(ValueError, match="not where the photos show") if wrong else contextlib.nullcontext():
         check_colors(scene, means, sh0)
+
+
+def test_a_cast_and_points_that_are_in_photos_by_chance_say_nothing_of_places(demo_scene: Path) -> None:
+    """Where all is green, colours are alike wherever they are taken from."""
+    cast = torch.tensor([0.1, 0.9, 0.4])
+    scene = load_scene(demo_scene)
+    green = [Picture((image * cast).to(torch.uint8), mask) for image, mask in (scene.images[k] for k in range(9))]
+    scene = replace(scene, images=ImageStore((), held=green), colors=scene.colors * cast, cloud=True)
+    assert not is_elsewhere(scene)
+    assert is_elsewhere(replace(scene, points=0.3 * scene.points))
+    far = scene.points.clone()
+    far[2:] += 1000
+    assert is_elsewhere(replace(scene, points=far))
 
 
 def test_points_are_taken_where_nothing_says_that_they_are_wrong(demo_scene: Path, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import json
 import struct
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from compressed_scenes import arrays_of
 from numpy.typing import NDArray
 from viewer_scenes import angles, plain_scene, sigmoid
 
-from nsvq_lightning.io import FormatError, read_scene, save
+from nsvq_lightning.io import FormatError, glb, read_scene, save
 
 NAME = "KHR_gaussian_splatting"
 # By the text of the extension: coefficients of degree l, in the order m = -l...l, turn half around z by (-1)^m.
@@ -275,3 +276,10 @@ def test_instances_of_a_node_are_told(tmp_path: Path, caplog: pytest.LogCaptureF
     document["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}
     assert len(read_scene(write(tmp_path / "y.glb", document, data))) == 20
     assert "a node has EXT_mesh_gpu_instancing, which is not read" in caplog.text
+
+
+def test_more_than_lengths_of_32_bits_can_say_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(glb, "_HEAD", SimpleNamespace(size=2**32 - 100))  # as of 18 million splats of degree 3
+    with pytest.raises(ValueError, match=r"scene\.glb: 429\d{7} bytes are more than a \.glb can have: write \.ply"):
+        save(plain_scene(5), tmp_path / "scene.glb")
+    assert not list(tmp_path.iterdir())
