@@ -130,12 +130,13 @@ OPENCV = "opencv-contrib-python-headless"
 def check_packages() -> Findings:
     """OpenCV, once: several packages overwrite each other's files."""
     try:
-        import cv2
+        from cv2 import __version__ as found  # which the folder that an uninstalled package leaves has not
     except ImportError as error:
-        yield Finding("problem", "opencv", f"cannot be loaded ({error}): pip install {OPENCV}")
+        advice = f"pip install {OPENCV} --force-reinstall --no-deps"
+        yield Finding("problem", "opencv", f"cannot be loaded ({error}): {advice}")
         return
     packages = sorted(set(packages_distributions().get("cv2", ())))
-    text = f"{cv2.__version__} ({' and '.join(packages) or 'not from pip'})"
+    text = f"{found} ({' and '.join(packages) or 'not from pip'})"
     advice = f"they overwrite each other's files; uninstall all of them, then pip install {OPENCV}"
     yield judged("opencv", text, advice, when=len(packages) > 1)
 

@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from cv2.typing import MatLike
 from PIL import Image, ImageOps
 from PIL.ExifTags import IFD, Base
 
@@ -30,6 +29,7 @@ from nsvq_lightning.data.images import DAMAGED, ImageHead, exif_of, is_transpare
 from nsvq_lightning.data.photo_files import CONVERTED, PHOTOS, RAW, masks_in, photos_below
 from nsvq_lightning.io.atomic import make_folder_of, sync, write_bytes, write_text
 from nsvq_lightning.io.errors import as_defect
+from nsvq_lightning.splats.conventions import Uint8s
 from nsvq_lightning.top_level import log
 
 # Photos that are named; of the others, their number is.
@@ -530,7 +530,7 @@ def some(names: Sequence[str], most: int = MAX_NAMED) -> str:
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown
 
 
-def sharpness(picture: MatLike) -> float:
+def sharpness(picture: Uint8s) -> float:
     """Variance of the Laplacian of a BGR picture ``[H, W, 3]``, at most 480 pixels wide: more is sharper."""
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
     factor = min(1.0, 480 / grey.shape[1])  # noise is no sharpness
@@ -580,7 +580,7 @@ def write_frames(video: Path, folder: Path, count: int, report: Report) -> list[
     return names
 
 
-def _frames(video: Path, done: Callable[[int], None]) -> Iterator[tuple[int, MatLike]]:
+def _frames(video: Path, done: Callable[[int], None]) -> Iterator[tuple[int, Uint8s]]:
     """The frames with their numbers; ``done`` is called with how many have been used."""
     reader = cv2.VideoCapture(str(video))
     for index in itertools.count():

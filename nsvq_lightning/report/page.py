@@ -10,11 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from cv2.typing import MatLike
 
 from nsvq_lightning.io.atomic import write_text
 from nsvq_lightning.report.numbers import Rows, Values
 from nsvq_lightning.report.viewer import data_address, fill, script_json
+from nsvq_lightning.splats.conventions import Uint8s
 from nsvq_lightning.training.schedule import Phase, Schedule
 from nsvq_lightning.version import __version__
 
@@ -160,14 +160,14 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return f'<div class="scroll"><table>{table}</table></div>'
 
 
-def _read(path: Path) -> MatLike:
-    picture = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
+def _read(path: Path) -> Uint8s:
+    picture: Uint8s | None = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
         raise OSError(f"{path} is not a picture any more; run 'nsvq test' again")
     return picture
 
 
-def _jpeg(picture: MatLike) -> str:
+def _jpeg(picture: Uint8s) -> str:
     """A picture as an address that holds it."""
     factor = min(1.0, 1000 / max(picture.shape[:2]))
     picture = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -106,9 +107,12 @@ def test_one_opencv_of_any_name_is_wanted(monkeypatch: pytest.MonkeyPatch) -> No
     packages.append("opencv-contrib-python-headless")
     finding = next(doctor.check_packages())
     assert (finding.verdict, "uninstall" in finding.text) == ("note", True)
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    finding = next(doctor.check_packages())
-    assert (finding.verdict, "pip install opencv" in finding.text) == ("problem", True)
+    # None of them, and the folder that is left where one of two was uninstalled.
+    for gone in (None, ModuleType("cv2")):
+        monkeypatch.setitem(sys.modules, "cv2", gone)
+        finding = next(doctor.check_packages())
+        assert (finding.verdict, "pip install opencv" in finding.text) == ("problem", True)
+        assert "--force-reinstall" in finding.text  # to pip, it is there
 
 
 def test_little_memory_and_disk_are_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
