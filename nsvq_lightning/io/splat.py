@@ -71,7 +71,7 @@ def read_splat(path: StrPath) -> CompressedScene:
     data = Path(path).read_bytes()
     with naming_file(path):
         # The format has no mark of its own; those of others are no coordinate of a splat.
-        if len(data) % _RECORD.itemsize or data[:4] in b"ply\n ply\r PK\3\4 \x1f\x8b\x08\0 NGSP \x89NSV glTF #usd":
+        if len(data) % _RECORD.itemsize or data[:3] in b"ply PK\3 \x1f\x8b\x08 NGS \x89NS glT #us":
             raise FormatError(f"truncated, or not a .splat file: {len(data)} bytes, {data[:4]!r}…, are no splats of 32")
     records = np.frombuffer(data, _RECORD)
     colors = records["colors"]

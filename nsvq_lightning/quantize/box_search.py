@@ -62,14 +62,16 @@ def _boxes(codebook: Array, order: Array) -> tuple[Array, ...]:
     count, dim = codebook.shape
     nodes = -(-count // 4096) * 16
     points, labels = np.full((256 * nodes, dim), np.inf, np.float32), np.full(256 * nodes, _NO_CODE)
-    points[:count], labels[:count] = codebook[order], order
+    points[:count], labels[:count] = codebook.take(order, 0), order
     points[np.isnan(points)] = np.inf  # where no code is chosen
     tree = [aligned_empty((16 * nodes, dim, 16)), labels]
     tree[0][:] = points.reshape(-1, 16, dim).mT
     low, high = points, points.copy()
     high[count:] = -np.inf
     for _ in range(2):  # corners of leaves, then of nodes
-        low, high = low.reshape(-1, 16, dim).min(1), high.reshape(-1, 16, dim).max(1)
+        # A copy with the lanes first, as NumPy is slow along a short axis in the middle.
+        low, high = (each.reshape(-1, 16, dim).swapaxes(0, 1).copy() for each in (low, high))
+        low, high = low.min(0), high.max(0)
         corners = [each.reshape(-1, 16, dim).mT for each in (low, high)]
         tree.append(aligned_empty((len(low) // 16, dim, 2, 16)))
         np.stack(corners, axis=2, out=tree[-1])

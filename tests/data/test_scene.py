@@ -491,6 +491,18 @@ def test_splats_in_another_frame_than_the_photos_are_told_by_their_colors(
         check_colors(scene, means, sh0)
 
 
+def test_damaged_photos_say_nothing_of_splats(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Runs leave them out; they took the cameras of all others away."""
+    shutil.copytree(demo_scene, tmp_path / "scene")
+    photo = tmp_path / "scene/images/view_003.png"
+    photo.write_bytes(photo.read_bytes()[:300])
+    scene = load_scene(tmp_path / "scene")
+    monkeypatch.setattr("nsvq_lightning.data.scene._FEW_POINTS", len(scene.points) - 1)
+    check_colors(scene, scene.points.numpy(), scene.colors[:, None].numpy())
+
+
 def test_a_cast_and_points_that_are_in_photos_by_chance_say_nothing_of_places(demo_scene: Path) -> None:
     """Where all is green, colours are alike wherever they are taken from."""
     cast = torch.tensor([0.1, 0.9, 0.4])

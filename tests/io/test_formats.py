@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gzip
 import logging
 import math
 from pathlib import Path
@@ -215,6 +216,7 @@ def test_a_file_of_another_format_is_no_splat_file(suffix: str, tmp_path: Path) 
     save(plain_scene(40), path)
     content = path.read_bytes()
     renamed = tmp_path / "scene.splat"
-    renamed.write_bytes(content + bytes(-len(content) % 32))
-    with pytest.raises(FormatError, match=r"not a \.splat file: .* are no splats of 32"):
-        load(renamed)
+    for written in (content, gzip.compress(content)):
+        renamed.write_bytes(written + bytes(-len(written) % 32))
+        with pytest.raises(FormatError, match=r"not a \.splat file: .* are no splats of 32"):
+            load(renamed)
