@@ -48,7 +48,6 @@ def run(options: Namespace) -> int:
     from nsvq_lightning.data import reconstruct
     from nsvq_lightning.data.images import ON_ITS_SIDE, image_head
     from nsvq_lightning.data.transforms import has_poses
-    from nsvq_lightning.training.run_folder import hold
 
     source, scene = options.source, options.scene
     if not source.exists():
@@ -61,6 +60,8 @@ def run(options: Namespace) -> int:
     images = scene / "images"
     in_place = source.resolve() == images.resolve()
     _claim(options, is_video, in_place)
+    from nsvq_lightning.training.run_folder import hold  # with Lightning, for which no error waits
+
     hold(scene)
     bars = {}
 
